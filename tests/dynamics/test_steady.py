@@ -18,7 +18,6 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.maxima import candidates, shoulders
 from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import floquet, message_of
@@ -218,7 +217,8 @@ def test_lines_are_those_of_the_sampled_force(scene):
         line = round(order * (len(force) // 2520) * period)
         expected = amplitudes[line] if present else 0.0
         # Impacts are narrow: the samples leave 1e-3 of the greatest line.
-        assert found == pytest.approx(expected, abs=1e-3 * evaluation.response["line_1_force_N"])
+        within = 1e-3 * present * evaluation.response["line_1_force_N"]
+        assert found == pytest.approx(expected, abs=within)
     # No motion of up to eight mesh periods has this line.
     assert evaluation.response["line_0.3_force_N"] == 0
     assert set(evaluation.gradient["line_0.3_force_N"].values()) == {0.0}
@@ -262,13 +262,6 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
     )
     difference = (problem.objective(up) - problem.objective(down)) / 2e-4
     assert problem.slope(here, point) @ unit == pytest.approx(difference, rel=1e-3)
-
-
-def test_a_line_the_baseline_has_not_got_is_refused():
-    config = load("configs/cic_drawn.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", ALL))
-    with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
-        Problem.of(config, evaluator.scene, evaluator(series=False))
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))

@@ -214,6 +214,10 @@ def test_absent_limits_add_nothing():
             ],
             "both be baseline",
         ),
+        (
+            ["constraints.outer_radius_min_mm=44.5", "constraints.outer_radius_max_mm=44.2"],
+            "outer_radius_max_mm` must be greater",
+        ),
         (["constraints.terms.line_02_force_N.max=1"], "line_ORDER"),
         ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
         (["constraints.terms.mean_force_N.most=3"], "most"),

@@ -20,6 +20,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import over_scenes
 from rootsopt.response.result import Part
 from rootsopt.response.scatter import draw, shifts
+from tests.response.test_speeds import relative
 from tests.standins import evaluation_of
 
 CIC = "configs/cic_drawn.yaml"
@@ -62,12 +63,6 @@ def ends(spread):
     problem = problem_of(evaluator, baseline)
     points = (POINT + sign * STEP * DIRECTION for sign in (1, -1))
     return [evaluator(problem.design(one), moved.start, series=False) for one in points]
-
-
-def relative(one, base):
-    """Return the config's objective by hand: half the mean force, half the peak."""
-    keys = "mean_force_N", "peak_force_N"
-    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
 
 
 def test_objective_combines_the_scenes(spread):
