@@ -52,12 +52,10 @@ def _near(pair, normals):
     return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
 
-SHORT = "pump", "four arcs"
-"""Scenes with every part, and with a contact that jumps."""
-
-
+# In short runs: scenes with every part, and with a contact that jumps.
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in SHORT)) for n in SCENES]
+    "name",
+    [pytest.param(n, marks=[pytest.mark.long] * (n not in ("pump", "four arcs"))) for n in SCENES],
 )
 def test_margins_have_the_sign_of_the_flags(name):
     pair = _pair(name)

@@ -53,13 +53,6 @@ def apart():
     return evaluator()()
 
 
-def swing(config):
-    """Return |ε| (rad) at which the gear carries a constant load."""
-    gear = config.scene.timing_gear
-    half = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
-    return half + config.scene.load.torque_N_m / gear.stiffness_N_m_per_rad
-
-
 @pytest.mark.parametrize("clearance", [0.15, 0.02])
 def test_gradients_are_those_of_differences(clearance):
     """This holds for flanks that stay apart, and for flanks that touch.
@@ -146,7 +139,11 @@ def test_share_of_machines_that_touch_has_a_closed_form(monkeypatch):
     reserve = found["contact_reserve_um"]
     # The longest lever is that of the involute, at the pressure angle.
     lever = config.profile.pitch_radius_mm * np.cos(np.deg2rad(config.design[0]))
-    assert reserve == pytest.approx(150 - 1e3 * lever * swing(config), rel=1e-3)
+    # |ε| (rad) at which the gear carries a constant load.
+    gear = config.scene.timing_gear
+    swing = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
+    swing += config.scene.load.torque_N_m / gear.stiffness_N_m_per_rad
+    assert reserve == pytest.approx(150 - 1e3 * lever * swing, rel=1e-3)
     assert clearance["contact_reserve_um_per_unit"] == pytest.approx(1e3, rel=1e-6)
     share = (140 - reserve) / 280
     error = np.sqrt(share * (1 - share) / found["machines"])

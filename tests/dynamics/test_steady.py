@@ -269,8 +269,7 @@ def test_spectral_radius(count, seed):
     matrix = np.random.default_rng(seed).normal(size=(count, count))
     expected = np.max(np.abs(np.linalg.eigvals(matrix)))
     assert float(spectral_radius(jnp.asarray(matrix))) == pytest.approx(expected, rel=1e-8)
-    first = floquet(matrix)[0]
-    assert np.hypot(*first) == pytest.approx(expected, rel=1e-9)
+    assert np.hypot(*floquet(matrix)[0]) == pytest.approx(expected, rel=1e-9)
     assert float(spectral_radius(jnp.asarray(np.triu(matrix, 1)))) == 0
 
 

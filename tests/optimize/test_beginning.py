@@ -90,7 +90,6 @@ def test_the_nearest_family_begins(tmp_path, monkeypatch):
     away = {"arc": 3e-5, "cic": 1e-6, "ellipse": 2e-6}
 
     def fitted(given, name):
-        del given
         return Likeness(name, {"arc_center_mm": 29.0}, away[name], 0.0) if name != "cic" else None
 
     monkeypatch.setattr(module, "classical", lambda: ("ee", "arc", "cic"))

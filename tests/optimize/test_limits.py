@@ -61,16 +61,13 @@ def evaluation(mean=50.0, peak=200.0, maxima=None):
     )
 
 
-OUTSIDE = {
-    "width": lambda profile, shape, forces: 1e4 * shape.outer_radius,
-    "ratio": lambda profile, shape, forces: forces.peak / forces.mean,
-}
-"""Ten times the outer radius (mm), and peak over mean force, as terms from outside."""
-
-
 @pytest.fixture
 def outside():
-    with registered(**OUTSIDE):
+    """Register ten times the outer radius (mm), and peak over mean force, as terms from outside."""
+    with registered(
+        width=lambda profile, shape, forces: 1e4 * shape.outer_radius,
+        ratio=lambda profile, shape, forces: forces.peak / forces.mean,
+    ):
         yield
 
 

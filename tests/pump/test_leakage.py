@@ -387,13 +387,6 @@ def test_overlap_is_negative():
     assert float(of("cic").overlap) == 0
 
 
-def at_clearances(profile, clearances):
-    """Return backlash, overlap (µm) and least play (mrad) at several clearances (µm)."""
-    found = [played(profile, 1e-6 * c, 2 * R, radial=0.0) for c in clearances]
-    rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
-    return np.array(rows, float).T
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("family", ["ee", "cic"])
 def test_play_is_continuous_in_the_overlap(family):
@@ -403,8 +396,11 @@ def test_play_is_continuous_in_the_overlap(family):
     points = points_of(profile, 240)
     points = points + 2e-3 * np.random.default_rng(0).normal(size=(len(points), 2)) @ [1, 1j]
     scattered = profile_of(points, 2e-3)[0]
+    # Backlash, overlap and clearance in µm, least play in mrad.
     clearance = np.array([-5.0, -0.5, 0.0, 0.5, 5.0])
-    backlash, overlap, play = at_clearances(scattered, clearance)
+    found = [played(scattered, 1e-6 * c, 2 * R, radial=0.0) for c in clearance]
+    rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
+    backlash, overlap, play = np.array(rows, float).T
     least = 1e6 * conjugacy(scattered).least
     assert -4 < least < -0.5
     assert overlap == pytest.approx(np.maximum(0, -least - clearance), abs=0.2)

@@ -23,7 +23,6 @@ WEIGHTS = "objective.speed_weights=[3, 1]"
 WORST = "objective.over_speeds=worst"
 TIGHT = "solver.rtol=1e-10"
 POINT = np.array([0.2, 0.3, 0.4])
-ROW = "speed_rpm", "status", "peak_force_N"
 
 
 def config_of(*overrides):
@@ -80,7 +79,9 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
         assert part.evaluation.gradient == single.gradient != {}
     # The evaluator is left at the scene's speed.
     assert float(evaluator.scene.speed) == pytest.approx(100 * np.pi)
-    rows = [[row[key] for key in ROW] for row in found.record()["speeds"]]
+    rows = [
+        [row["speed_rpm"], row["status"], row["peak_force_N"]] for row in found.record()["speeds"]
+    ]
     assert rows == [
         [speed, "periodic", alone[speed].response["peak_force_N"]] for speed in (2000, 3000, 4000)
     ]

@@ -1,23 +1,19 @@
 """Objective terms: the table, the package's own, and the one of docs/extending.md."""
 
-import re
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rootsopt import InputError, Scene, load_config, register_term
-from rootsopt.config.sources import import_named
 from rootsopt.optimize.problem import Problem
 from rootsopt.pump.sheet import sheet
 from rootsopt.response import terms
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import RESPONSES
 from rootsopt.response.terms import values_of
+from tests.conformance.test_extending import imported
 from tests.standins import Own
 
-PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 CIC = "configs/cic_drawn.yaml"
 OUTSIDE = "revolutions_per_litre"
 NAMES = (
@@ -38,13 +34,7 @@ PUMP = (
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory):
     """Register the term of docs/extending.md from its file."""
-    (text,) = re.findall(
-        r"^```python displacement.py\n(.*?)^```", PAGE.read_text("utf-8"), re.S | re.M
-    )
-    assert len(text.splitlines()) <= 60
-    path = tmp_path_factory.mktemp("term") / "displacement.py"
-    path.write_text(text, encoding="utf-8")
-    import_named(str(path))
+    imported("displacement.py", tmp_path_factory.mktemp("term"), 60)
     yield terms.terms_of([OUTSIDE])[0]
     del terms._terms[OUTSIDE]
 
