@@ -230,15 +230,15 @@ def test_flanks_touch_where_the_reserve_is_used_up(held, key, name):
     unit, sign = (-1e-3, -1) if name.endswith("um") else (1.0, 1)
     end = held.response[name] * unit + config_of("contact.clearance_mm=0.3").value(key)
     for step, status in ((-2e-4, Status.IDLE), (2e-4, Status.PERIODIC)):
-        config = config_of("contact.clearance_mm=0.3", f"{key}={end + sign * step}")
-        found = Evaluator.of(config)(series=False)
+        changes = "contact.clearance_mm=0.3", f"{key}={end + sign * step}"
+        found = Evaluator.of(config_of(*changes))(series=False)
         assert found.status is status
     assert 0 < found.response["mean_force_N"] < 5
 
 
 def test_optimize_says_what_to_minimise_instead(tmp_path, capsys):
-    arguments = [CIC, "-o", str(tmp_path / "out"), "--set", "contact.clearance_mm=0.3"]
-    assert optimize.main([*arguments, "--no-figures"]) == 2
+    wide = "--set", "contact.clearance_mm=0.3"
+    assert optimize.main([CIC, "-o", str(tmp_path / "out"), *wide, "--no-figures"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "its flanks never touch" in said
     assert "terms: {leakage_fraction: 1}" in said

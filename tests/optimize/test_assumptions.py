@@ -18,7 +18,6 @@ from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Search
 from rootsopt.response.reducers import over_scenes
 from rootsopt.response.result import Part
 from rootsopt.response.scatter import assumed, in_conditions
@@ -214,13 +213,11 @@ def test_scenes_are_named_and_seeded():
 
 
 def test_nothing_without_a_motion_or_after_a_stop():
-    """Without scenes of tolerances or assumptions, the search is the plain one."""
     config, result, _ = spread()
     assert compared(config, result, stop=lambda: True) is None
     still = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
     small = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2")
     assert search_of(load("cic_drawn", [*small, still])).run().assumptions is None
-    assert type(search_of(load("cic_drawn", [*QUICK, "assumptions.scenes=0"]))) is Search
 
 
 @pytest.mark.long

@@ -249,7 +249,7 @@ def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
         search_of(config)
 
 
-def test_without_tolerances_the_search_is_the_plain_one():
+def test_without_tolerances_and_assumptions_the_search_is_the_plain_one():
     config = without(config_of("assumptions.scenes=0"))
     assert type(search_of(config)) is Search
     assert "tolerances" not in config.to_yaml()

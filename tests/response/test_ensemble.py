@@ -201,8 +201,10 @@ def test_one_member_that_fails_is_enough():
 
 def told(monkeypatch, run, gradient=False):
     """Evaluate an ensemble whose members are made up by `run(index of the pair)`."""
-    made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
-    monkeypatch.setattr("rootsopt.response.ensemble.run_members", made)
+    monkeypatch.setattr(
+        "rootsopt.response.ensemble.run_members",
+        lambda pairs, *rest: [run(k) for k in range(len(pairs))],
+    )
     return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
 
 
