@@ -37,8 +37,8 @@ def erring(lobes, size=SIZE):
     pair = oscillator(lobes=lobes)
     errors = GearErrors(*map(jnp.asarray, (size, ANGLE, TOOTH)))
     pair = eqx.tree_at(lambda p: p.gear.errors, pair, errors, is_leaf=lambda x: x is None)
-    scales = (1e-3, 0.02, 1.0)  # Teeth swing fast, and the load closes the backlash slowly.
-    times = Timescales(*map(jnp.asarray, scales))
+    # Teeth swing fast, and the load closes the backlash slowly.
+    times = Timescales(*map(jnp.asarray, (1e-3, 0.02, 1.0)))
     return eqx.tree_at(lambda p: p.timescales, pair, times, is_leaf=lambda x: x is None)
 
 

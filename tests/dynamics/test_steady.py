@@ -145,8 +145,7 @@ def test_no_number_without_its_status(name):
     kinds = {Status.PERIODIC: "periodic", Status.TOO_DEEP: "periodic", Status.CHAOTIC: "chaotic"}
     assert evaluation.steady_state["kind"] == kinds.get(status, "transient")
     # Strict JSON knows no NaN and no infinity.
-    record = json.loads(json.dumps(evaluation.record(), allow_nan=False))
-    assert record["status"] == status.label
+    assert json.loads(json.dumps(evaluation.record(), allow_nan=False))["status"] == status.label
     if described:
         mean, peak, rms = (evaluation.response[name] for name in RESPONSES)
         assert 0 < mean <= rms <= peak

@@ -26,8 +26,7 @@ def scene_of(name: str, *changes: str) -> tuple[Scene, np.ndarray]:
 
 @eqx.filter_jit
 def forces(pair, phi, relative):
-    rate = jnp.asarray(0.3)
-    return jax.lax.map(lambda x: pair.contact_force(x, relative, rate), phi)
+    return jax.lax.map(lambda x: pair.contact_force(x, relative, jnp.asarray(0.3)), phi)
 
 
 @pytest.fixture(scope="module")

@@ -66,8 +66,7 @@ def test_errors_are_those_of_known_standard_deviations(monkeypatch):
 
 def test_errors_without_standard_deviations_are_those_of_leaving_out_one_value(monkeypatch):
     """HC3 is the sum over all values of what leaving one out changes, to first order."""
-    data = noisy(0.05 * (X > 1.5))
-    problem = problem_of(wave, data, monkeypatch)
+    problem = problem_of(wave, noisy(0.05 * (X > 1.5)), monkeypatch)
     best = solved(problem, turn=1e9)
     kept = [np.arange(len(X)) != k for k in range(len(X))]
     moved = np.array([np.linalg.lstsq(best.slopes[k], -best.residual[k], None)[0] for k in kept])

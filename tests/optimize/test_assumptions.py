@@ -103,8 +103,7 @@ def test_record_counts_the_scenes():
     x = np.array([found.scenes[name][LOAD] for name in [*found.scenes][5:]])
     expected = scipy.stats.spearmanr(x[known], some).statistic
     assert record["keys"][0]["rank_correlation"] == pytest.approx(expected)
-    column = found.columns()["objective_optimized"]
-    assert column == pytest.approx(values.tolist(), nan_ok=True)
+    assert found.columns()["objective_optimized"] == pytest.approx(values.tolist(), nan_ok=True)
 
 
 def test_where_it_is_worse_and_which_design_wins():

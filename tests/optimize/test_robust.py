@@ -149,8 +149,7 @@ def toy(monkeypatch, branches, *overrides):
                      np.zeros((0, 1)))  # fmt: skip
 
     def local(self, evaluation, point=None):
-        number = int(evaluation.response["mean_force_N"])
-        return local_of(number, evaluation.design["x0"])
+        return local_of(int(evaluation.response["mean_force_N"]), evaluation.design["x0"])
 
     monkeypatch.setattr(Problem, "local", local)
     monkeypatch.setattr(Problem, "objective", lambda self, one: local(self, one).objective)

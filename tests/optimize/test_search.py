@@ -187,8 +187,7 @@ def test_a_local_search_begins_beside_a_start_without_a_usable_motion(hole):
     search.noisy = False
     search.stage.local = lambda _, *given: local(*given)
     vars(search.problem).update(toward=lambda point, inside: np.clip(point, 0, 1), limits_at=None)
-    trials = search._solve(0, start)
-    tried = sum(trial.local is None for trial in trials)
+    tried = sum(trial.local is None for trial in search._solve(0, start))
     assert tried == {0.0: 0, 1e-6: 1, 5e-4: 3, 1.0: 5}[hole]
     assert (search._descents[0].local is None) == (hole == 1)
 

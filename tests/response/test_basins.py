@@ -141,8 +141,7 @@ def test_a_chaotic_basin_is_no_steady_state():
     )
     found = Evaluator.of_objective(config_of(*scene, "objective.motion=worst"))(series=False)
     assert (found.status, found.usable, found.gradient) == (Status.CHAOTIC, False, {})
-    kinds = {row["status"] for row in found.steady_state["attractors"]}
-    assert kinds == {"periodic", "chaotic"}
+    assert {row["status"] for row in found.steady_state["attractors"]} == {"periodic", "chaotic"}
 
 
 def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):

@@ -224,8 +224,7 @@ def test_structures_are_told_apart(config):
 
 
 def test_a_batch_that_fails_is_done_one_by_one(config, monkeypatch):
-    broken = mock.Mock(side_effect=MemoryError)
-    monkeypatch.setattr(points, "evaluate_together", broken)
+    monkeypatch.setattr(points, "evaluate_together", mock.Mock(side_effect=MemoryError))
     assert simulated_together(config, POINTS[:1]) == [simulated(config, POINTS[0])]
 
 

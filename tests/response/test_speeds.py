@@ -122,8 +122,9 @@ def test_slope_agrees_with_central_differences(baseline, moved):
 
 def test_each_speed_begins_on_its_own_orbit(baseline, moved):
     evaluator, found, _ = baseline
-    reached = Evaluator.reached
-    with mock.patch.object(Evaluator, "reached", autospec=True, side_effect=reached) as spy:
+    with mock.patch.object(
+        Evaluator, "reached", autospec=True, side_effect=Evaluator.reached
+    ) as spy:
         again = evaluator(start=found.start, series=False)
     asked = [call.args[2] for call in spy.call_args_list]
     for start, new, old in zip(asked, again.speeds, found.speeds, strict=True):

@@ -227,8 +227,9 @@ def test_parts_are_the_evaluations_of_moved_configs(spread):
 
 def test_scenes_begin_on_their_own_orbits(spread):
     evaluator, found = spread
-    reached = Evaluator.reached
-    with mock.patch.object(Evaluator, "reached", autospec=True, side_effect=reached) as spy:
+    with mock.patch.object(
+        Evaluator, "reached", autospec=True, side_effect=Evaluator.reached
+    ) as spy:
         again = evaluator(start=found.start, series=False)
     asked = {id(call.args[2]) for call in spy.call_args_list}
     assert asked == {id(part.evaluation.start) for part in found.scenes}
