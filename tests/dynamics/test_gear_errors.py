@@ -52,7 +52,7 @@ def limits(time, size=SIZE):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("lobes", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("lobes", [3, 4, 5, 6])
 def test_orbit_is_closed_after_a_turn(lobes):
     """The silent orbit is the linear motion at every number of lobes, and stops at one turn.
 
