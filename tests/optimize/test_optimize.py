@@ -321,7 +321,6 @@ def test_signals_to_the_command(tmp_path, after, number):
 # Interrupted and resumed searches, which equal an uninterrupted one to the last bit
 
 
-SHORT = [f"optimizer.{one}" for one in ("screening=2", "starts=1", "iterations=2", "prove=false")]
 HEADER = {"config": {"a": 1}, "versions": {"jax": "1"}}
 
 
@@ -364,15 +363,15 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-SPEEDS = "objective.speeds_rpm=[2700, 3300]"
-
-
-@pytest.mark.parametrize("more", [(), pytest.param((SPEEDS,), marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "more", [(), pytest.param(("objective.speeds_rpm=[2700, 3300]",), marks=pytest.mark.long)]
+)
 def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
     """The file is cut at a random byte, as after a kill, and its lines are damaged at random.
 
     Orbits are closed from those of neighbours, which the file does not hold."""
-    settings, path = config(*SHORT, *more), tmp_path / "c"
+    short = "screening=2", "starts=1", "iterations=2", "prove=false"
+    settings, path = config(*(f"optimizer.{one}" for one in short), *more), tmp_path / "c"
     full = Checkpoint(HEADER, path)
     expected = outcome(Search(settings, checkpoint=full).run())
     assert b"from_neighbour" in path.read_bytes()

@@ -118,13 +118,10 @@ def test_scenes_of_tolerances():
 # Values of one key as a user writes them
 
 
-BACKLASH = "scene.timing_gear.backlash_mm"
-
-
 @pytest.mark.parametrize(
     ("key", "given", "values"),
     [
-        (BACKLASH, "0.05,0.1, 0.2", (0.05, 0.1, 0.2)),
+        ("scene.timing_gear.backlash_mm", "0.05,0.1, 0.2", (0.05, 0.1, 0.2)),
         (SPEED, "300:600:4", (300.0, 400.0, 500.0, 600.0)),
         (SPEED, "600:300:3", (600.0, 450.0, 300.0)),
         (SPEED, "1:100:3:log,7", (1.0, 10.0, 100.0, 7)),
