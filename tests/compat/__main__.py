@@ -39,7 +39,6 @@ TESTS = (
     "tests/view/test_report.py",
     "tests/runtime/test_store.py",
     "tests/scene/test_scene.py",
-    "tests/response/test_axes.py",
     "tests/response/test_plan.py",
     "tests/response/test_journal.py",
 )

@@ -17,7 +17,6 @@ SPEED = 314.0
 
 def nothing(part, motion, own):
     """Return 0: no energy, no power."""
-    del part, motion, own
     return jnp.zeros(())
 
 

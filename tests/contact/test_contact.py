@@ -11,9 +11,8 @@ from rootsopt.dynamics.parts import TimingGear
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.soundness import margins
 from rootsopt.scene.families import profile_of
+from tests.profiles.test_families import DEG, R, cic
 
-R = 0.033
-DEG = np.pi / 180
 PROFILES = {
     "paper": CIC(3, R, 36.43 * DEG, 9e-3, 4 * DEG),
     "short": CIC(3, R, 27.3 * DEG, 0.8e-3, 1.3 * DEG),
@@ -25,11 +24,6 @@ PROFILES = {
 closest = jax.jit(lambda pair, x, e: jax.vmap(pair)(x, e))
 offsets = jax.jit(lambda pair, *at: jax.vmap(pair._mesh)(*at)[0])
 paired = jax.jit(FlankPair.of)
-
-
-def cic(lobes, alpha, fraction, tip):
-    """Return a CIC profile with u given as a fraction of u_max."""
-    return CIC(lobes, R, alpha, fraction * R * np.sin(alpha) * (np.pi / (2 * lobes) - tip), tip)
 
 
 def results(design, roll, relative):

@@ -13,23 +13,22 @@ from rootsopt.contact.search import NearContact, SearchContact
 from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.profiles import CIC, arc, four_arcs
 from rootsopt.response.evaluation import Evaluator
+from tests.dynamics.collocation.test_known import ARCS
 
 paired = eqx.filter_jit(FlankPair.of)
-GAS = [
-    "scene.load={pressure_difference_Pa: 2.0e4}",
-    "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
-    "friction_speed_mm_s: 1000}",
-]
-FOUR_ARCS = (
-    "profile={family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964, "
-    "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22}"
-)
 SCENES = {
     "cic_drawn": ("cic_drawn", []),
     "ee": ("ee", []),
-    "gas and friction": ("cic_drawn", GAS),
+    "gas and friction": (
+        "cic_drawn",
+        [
+            "scene.load={pressure_difference_Pa: 2.0e4}",
+            "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
+            "friction_speed_mm_s: 1000}",
+        ],
+    ),
     "pump": ("pump", []),
-    "four arcs": ("cic_drawn", [FOUR_ARCS, "optimizer.bounds={}"]),
+    "four arcs": ("cic_drawn", ARCS),
 }
 
 
@@ -52,12 +51,10 @@ def _near(pair, normals):
     return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
 
-SHORT = "pump", "four arcs"
-"""Scenes with every part, and with a contact that jumps."""
-
-
+# In short runs: scenes with every part, and with a contact that jumps.
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in SHORT)) for n in SCENES]
+    "name",
+    [pytest.param(n, marks=[pytest.mark.long] * (n not in ("pump", "four arcs"))) for n in SCENES],
 )
 def test_margins_have_the_sign_of_the_flags(name):
     pair = _pair(name)

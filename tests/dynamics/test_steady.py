@@ -18,8 +18,6 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.maxima import candidates, shoulders
 from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.errors import InputError
-from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import floquet, message_of
 from rootsopt.response.result import RESPONSES
@@ -147,8 +145,7 @@ def test_no_number_without_its_status(name):
     kinds = {Status.PERIODIC: "periodic", Status.TOO_DEEP: "periodic", Status.CHAOTIC: "chaotic"}
     assert evaluation.steady_state["kind"] == kinds.get(status, "transient")
     # Strict JSON knows no NaN and no infinity.
-    record = json.loads(json.dumps(evaluation.record(), allow_nan=False))
-    assert record["status"] == status.label
+    assert json.loads(json.dumps(evaluation.record(), allow_nan=False))["status"] == status.label
     if described:
         mean, peak, rms = (evaluation.response[name] for name in RESPONSES)
         assert 0 < mean <= rms <= peak
@@ -218,7 +215,8 @@ def test_lines_are_those_of_the_sampled_force(scene):
         line = round(order * (len(force) // 2520) * period)
         expected = amplitudes[line] if present else 0.0
         # Impacts are narrow: the samples leave 1e-3 of the greatest line.
-        assert found == pytest.approx(expected, abs=1e-3 * evaluation.response["line_1_force_N"])
+        within = 1e-3 * present * evaluation.response["line_1_force_N"]
+        assert found == pytest.approx(expected, abs=within)
     # No motion of up to eight mesh periods has this line.
     assert evaluation.response["line_0.3_force_N"] == 0
     assert set(evaluation.gradient["line_0.3_force_N"].values()) == {0.0}
@@ -242,33 +240,12 @@ def test_p_norm_tends_to_the_peak_as_stated():
 
 
 def test_objective_takes_the_lines_and_the_norm_as_weighted():
-    config = load(
-        "configs/cic_drawn.yaml",
-        [*ALL, "objective.line_weights={1: 1, 2: 2}", "objective.rms_weight=1"],
-    )
-    weights = objective_weights(config)
+    changes = *ALL, "objective.line_weights={1: 1, 2: 2}", "objective.rms_weight=1"
+    weights = objective_weights(load("configs/cic_drawn.yaml", changes))
     assert sum(weights.values()) == pytest.approx(1)
     assert weights["line_2_force_N"] == pytest.approx(2 / 5)
     assert weights["peak_norm_force_N"] == pytest.approx(0.5 / 5)
     assert "peak_force_N" not in weights
-    evaluator = Evaluator.of(config)
-    baseline = evaluator(series=False)
-    problem = Problem.of(config, evaluator.scene, baseline)
-    assert problem.objective(baseline) == pytest.approx(1)
-    point = problem.point(list(baseline.design.values())) * 0.99
-    unit = np.array([1.0, -0.5, 0.5])
-    down, here, up = (
-        evaluator(problem.design(point + h * unit), series=False) for h in (-1e-4, 0.0, 1e-4)
-    )
-    difference = (problem.objective(up) - problem.objective(down)) / 2e-4
-    assert problem.slope(here, point) @ unit == pytest.approx(difference, rel=1e-3)
-
-
-def test_a_line_the_baseline_has_not_got_is_refused():
-    config = load("configs/cic_drawn.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", ALL))
-    with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
-        Problem.of(config, evaluator.scene, evaluator(series=False))
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
@@ -276,8 +253,7 @@ def test_spectral_radius(count, seed):
     matrix = np.random.default_rng(seed).normal(size=(count, count))
     expected = np.max(np.abs(np.linalg.eigvals(matrix)))
     assert float(spectral_radius(jnp.asarray(matrix))) == pytest.approx(expected, rel=1e-8)
-    first = floquet(matrix)[0]
-    assert np.hypot(*first) == pytest.approx(expected, rel=1e-9)
+    assert np.hypot(*floquet(matrix)[0]) == pytest.approx(expected, rel=1e-9)
     assert float(spectral_radius(jnp.asarray(np.triu(matrix, 1)))) == 0
 
 

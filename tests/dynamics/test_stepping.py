@@ -315,18 +315,22 @@ def test_two_changes_at_one_instant():
     assert row @ way == pytest.approx(slope, abs=1e-5 * np.max(np.abs(row)))
 
 
-JOINT = (
-    "scene.speed_rpm=1015.7",
-    "scene.load.torque_N_m=3",
-    "scene.timing_gear.backlash_mm=0.055",
-    "scene.timing_gear.damping_ratio=0.515",
-    "scene.timing_gear.stiffness_N_m_per_rad=11307",
-)
-CORNER = ("scene.load.torque_N_m=4.775",)
-
-
 @pytest.mark.parametrize(
-    ("scene", "design"), [(JOINT, (39.33, 8.83, 1.32)), (CORNER, (34.0, 7.0, 3.0))]
+    ("scene", "design"),
+    [
+        (
+            (
+                "scene.speed_rpm=1015.7",
+                "scene.load.torque_N_m=3",
+                "scene.timing_gear.backlash_mm=0.055",
+                "scene.timing_gear.damping_ratio=0.515",
+                "scene.timing_gear.stiffness_N_m_per_rad=11307",
+            ),
+            (39.33, 8.83, 1.32),
+        ),
+        (("scene.load.torque_N_m=4.775",), (34.0, 7.0, 3.0)),
+    ],
+    ids=["joint", "corner"],
 )
 def test_the_check_bounds_the_error(scene, design):
     """The disagreement bounds the errors of all gradients, at any tolerance.

@@ -14,7 +14,6 @@ from rootsopt.contact.search import SearchContact
 from rootsopt.contact.wrapped import MOST, TwistedContact, sliced_mean, slices_needed, slices_of
 from rootsopt.dynamics.parts import TwistedLoad
 
-TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
 pair_of = eqx.filter_jit(Scene.pair)
 torques = eqx.filter_jit(lambda load, phi: jax.vmap(load.torque2)(phi))
 PHI, DEPTHS = np.linspace(0, 2 * np.pi / 3, 1200, endpoint=False), (2e-4, -3e-4)
@@ -27,8 +26,7 @@ def scene_of(name: str, *changes: str) -> tuple[Scene, np.ndarray]:
 
 @eqx.filter_jit
 def forces(pair, phi, relative):
-    rate = jnp.asarray(0.3)
-    return jax.lax.map(lambda x: pair.contact_force(x, relative, rate), phi)
+    return jax.lax.map(lambda x: pair.contact_force(x, relative, jnp.asarray(0.3)), phi)
 
 
 @pytest.fixture(scope="module")

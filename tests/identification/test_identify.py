@@ -22,7 +22,6 @@ from rootsopt.response.evaluation import Evaluator
 BACKLASH, LOAD = "scene.timing_gear.backlash_mm", "scene.load.torque_N_m"
 DAMPING = "scene.timing_gear.damping_ratio"
 TRUE = {BACKLASH: 0.14, LOAD: 5.5}
-BOUNDS = {BACKLASH: (0.05, 0.3), LOAD: (3.0, 9.0)}
 FEW = "attractors.relatives=4", "attractors.rates=3"
 CIC = load_config("cic", FEW)
 
@@ -195,7 +194,7 @@ def test_gain_offset_and_rotation_of_a_record_are_found():
 
 
 def test_more_quantities_than_values_are_not_determined():
-    keys = {**BOUNDS, "contact.stiffness_N_per_mm_e": (1e5, 4e5)}
+    keys = {BACKLASH: (0.05, 0.3), LOAD: (3.0, 9.0), "contact.stiffness_N_per_mm_e": (1e5, 4e5)}
     record = {name: simulated().response[name] for name in ("mean_force_N", "peak_force_N")}
     found = rootsopt.identify(CIC.replaced({LOAD: 12.0}), record, keys, starts=1)
     assert (found.status, found.combinations[0]["determined"]) == (Status.IDENTIFIED, False)

@@ -50,8 +50,7 @@ def test_members_get_the_gap_of_an_inset(tmp_path):
     assert found.likeness.inset == pytest.approx(1e-4, abs=0.5e-6)
     assert found.likeness.rms < found.likeness.departure < 2e-6
     assert (found.config.profile.family, found.widened) == ("cic", ())
-    parameters = found.config.profile.parameters
-    assert parameters == pytest.approx(BASE.profile.parameters, rel=0.01)
+    assert found.config.profile.parameters == pytest.approx(BASE.profile.parameters, rel=0.01)
     gap = found.config.contact.clearance_mm
     assert gap == pytest.approx(0.03 + 2e3 * found.likeness.inset, abs=1e-6)
     for said in (f"--set contact.clearance_mm={gap:.6g}`", "inset 0.1 mm"):
@@ -89,7 +88,6 @@ def test_the_nearest_family_begins(tmp_path, monkeypatch):
     away = {"arc": 3e-5, "cic": 1e-6, "ellipse": 2e-6}
 
     def fitted(given, name):
-        del given
         return Likeness(name, {"arc_center_mm": 29.0}, away[name], 0.0) if name != "cic" else None
 
     monkeypatch.setattr(module, "classical", lambda: ("ee", "arc", "cic"))

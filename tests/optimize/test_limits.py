@@ -61,16 +61,13 @@ def evaluation(mean=50.0, peak=200.0, maxima=None):
     )
 
 
-OUTSIDE = {
-    "width": lambda profile, shape, forces: 1e4 * shape.outer_radius,
-    "ratio": lambda profile, shape, forces: forces.peak / forces.mean,
-}
-"""Ten times the outer radius (mm), and peak over mean force, as terms from outside."""
-
-
 @pytest.fixture
 def outside():
-    with registered(**OUTSIDE):
+    """Register ten times the outer radius (mm), and peak over mean force, as terms from outside."""
+    with registered(
+        width=lambda profile, shape, forces: 1e4 * shape.outer_radius,
+        ratio=lambda profile, shape, forces: forces.peak / forces.mean,
+    ):
         yield
 
 
@@ -214,10 +211,16 @@ def test_absent_limits_add_nothing():
             ],
             "both be baseline",
         ),
+        (
+            ["constraints.outer_radius_min_mm=44.5", "constraints.outer_radius_max_mm=44.2"],
+            "outer_radius_max_mm` must be greater",
+        ),
         (["constraints.terms.line_02_force_N.max=1"], "line_ORDER"),
         ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
         (["constraints.terms.mean_force_N.most=3"], "most"),
         (["constraints.terms.mean_force_N.max=.nan"], "constraints"),
+        # A term to be maximised belongs into a limit or a front.
+        (["objective.terms.area_efficiency=1"], "area_efficiency.*constraints.*pareto"),
     ],
 )
 def test_refused_limits(overrides, words):

@@ -20,6 +20,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import over_scenes
 from rootsopt.response.result import Part
 from rootsopt.response.scatter import draw, shifts
+from tests.response.test_speeds import relative
 from tests.standins import evaluation_of
 
 CIC = "configs/cic_drawn.yaml"
@@ -62,12 +63,6 @@ def ends(spread):
     problem = problem_of(evaluator, baseline)
     points = (POINT + sign * STEP * DIRECTION for sign in (1, -1))
     return [evaluator(problem.design(one), moved.start, series=False) for one in points]
-
-
-def relative(one, base):
-    """Return the config's objective by hand: half the mean force, half the peak."""
-    keys = "mean_force_N", "peak_force_N"
-    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
 
 
 def test_objective_combines_the_scenes(spread):
@@ -156,8 +151,7 @@ def toy(monkeypatch, branches, *overrides):
                      np.zeros((0, 1)))  # fmt: skip
 
     def local(self, evaluation, point=None):
-        number = int(evaluation.response["mean_force_N"])
-        return local_of(number, evaluation.design["x0"])
+        return local_of(int(evaluation.response["mean_force_N"]), evaluation.design["x0"])
 
     monkeypatch.setattr(Problem, "local", local)
     monkeypatch.setattr(Problem, "objective", lambda self, one: local(self, one).objective)
@@ -256,7 +250,7 @@ def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
         search_of(config)
 
 
-def test_without_tolerances_the_search_is_the_plain_one():
+def test_without_tolerances_and_assumptions_the_search_is_the_plain_one():
     config = without(config_of("assumptions.scenes=0"))
     assert type(search_of(config)) is Search
     assert "tolerances" not in config.to_yaml()

@@ -17,7 +17,6 @@ from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
 from rootsopt.optimize.design import pareto_front
-from rootsopt.optimize.limits import check_senses
 from rootsopt.optimize.local import Group, certify
 from rootsopt.optimize.tradeoffs import assembly
 from rootsopt.optimize.tradeoffs.assembly import Node, points_of, selected
@@ -257,11 +256,6 @@ def test_interrupted_front_keeps_its_points():
 def test_refused_configs(override, words):
     with pytest.raises(InputError, match=words):
         pareto_front(config(override))
-
-
-def test_objective_refuses_terms_to_be_maximised():
-    with pytest.raises(InputError, match=r"area_efficiency.*constraints.*pareto"):
-        check_senses(config("objective.terms.area_efficiency=1"))
 
 
 def test_peaks_are_branches_of_one_group():

@@ -378,10 +378,10 @@ HARD = {
     "ellipse": (5, [[9.46007216, 27.8267607]]),
     "free_form": (3, [[4.0, 0.8, 0.7, 0.75], [5.04175591, 0.98336944, 0.83837998, -0.4203177]]),
 }
-"""Number of lobes and designs (config units) of each family."""
+"""Number of lobes and designs (config units) of each family; one that is missing fails."""
 
 
-@pytest.mark.parametrize("family", HARD)
+@pytest.mark.parametrize("family", [one for one in FAMILY_KEYS if one != "outline"])
 def test_area_and_moment_are_those_of_the_outline(family):
     lobes, designs = HARD[family]
     designs = np.array(designs).reshape(len(designs), -1)
@@ -389,7 +389,3 @@ def test_area_and_moment_are_those_of_the_outline(family):
     assert np.max(reference) < ERROR / 10
     assert np.max(area) < ERROR
     assert np.max(moment) < ERROR
-
-
-def test_every_family_is_looked_at():
-    assert set(HARD) == {*families()} - {"outline"}

@@ -12,20 +12,19 @@ from rootsopt.commands.table import profile as command
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
+from rootsopt.profiles import CIC, EE, FreeForm, project
 from rootsopt.profiles.geometry import departure
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, free_form_of, profile_of
 from rootsopt.scene.space import sobol
+from tests.conformance.families import R, measure
 from tests.optimize.test_optimize import SCENE, baseline
 from tests.standins import refusal
 
-R = 0.033
 DEG = np.pi / 180
 TIP = 2 * DEG
 SHARES = np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3])
 CIC_KEYS = "pressure_angle_deg: 36.43,\n          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0"
-measure = jax.jit(geometry)
 
 
 def made(family, *design):

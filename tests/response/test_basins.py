@@ -21,7 +21,6 @@ COEXIST = (
     "scene.timing_gear.damping_ratio=0.2",
     "scene.speed_rpm=6000",
 )
-WEAK = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
 GRID = "attractors.relatives=3", "attractors.rates=3"
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
@@ -141,8 +140,7 @@ def test_a_chaotic_basin_is_no_steady_state():
     )
     found = Evaluator.of_objective(config_of(*scene, "objective.motion=worst"))(series=False)
     assert (found.status, found.usable, found.gradient) == (Status.CHAOTIC, False, {})
-    kinds = {row["status"] for row in found.steady_state["attractors"]}
-    assert kinds == {"periodic", "chaotic"}
+    assert {row["status"] for row in found.steady_state["attractors"]} == {"periodic", "chaotic"}
 
 
 def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
@@ -180,4 +178,5 @@ def test_command(tmp_path, capsys):
     assert len(numbers) == 9
     assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "response_2.csv").exists()
-    assert run(tmp_path / "lost", *WEAK, options=["--no-figures"]) == (3, "passed_through", [])
+    weak = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
+    assert run(tmp_path / "lost", *weak, options=["--no-figures"]) == (3, "passed_through", [])

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import functools
 import itertools
 import json
 
@@ -11,21 +10,20 @@ import numpy as np
 import pytest
 
 from rootsopt import Status, optimize
-from rootsopt.config import EnsembleConfig, family_of, load
+from rootsopt.config import EnsembleConfig, family_of
 from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import ERRORS, RESPONSES
 from rootsopt.response.together import Members
 from rootsopt.view import tables
+from tests.response.test_speeds import config_of
 
 PERIODIC = ("ensemble.members=4", "ensemble.settle_periods=48", "ensemble.periods=8")
-GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"
-CHAOTIC = (GEAR, "scene.load.torque_N_m=1", "objective.motion=ensemble")
+CHAOTIC = (
+    "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}",
+    *("scene.load.torque_N_m=1", "objective.motion=ensemble"),
+)
 INSIDE = (30.0, 4.0, 3.0)
-
-
-def config_of(*overrides):
-    return load("configs/cic_drawn.yaml", overrides)
 
 
 def averaged(*overrides, gradient=False, survey=True, design=None, start=None):
@@ -205,8 +203,10 @@ def test_one_member_that_fails_is_enough():
 
 def told(monkeypatch, run, gradient=False):
     """Evaluate an ensemble whose members are made up by `run(index of the pair)`."""
-    made = lambda pairs, *rest: [run(k) for k in range(len(pairs))]  # noqa: E731
-    monkeypatch.setattr("rootsopt.response.ensemble.run_members", made)
+    monkeypatch.setattr(
+        "rootsopt.response.ensemble.run_members",
+        lambda pairs, *rest: [run(k) for k in range(len(pairs))],
+    )
     return averaged("ensemble.members=4", "ensemble.designs=12", gradient=gradient)
 
 
@@ -289,18 +289,13 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
         assert result["optimized"] is None
 
 
-@functools.cache
-def chaotic(seed=0, members=32, periods=32):
-    size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
-    return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
-
-
 @pytest.mark.long
 def test_standard_errors_are_honest():
-    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(5)]
-    apart = []
-    for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
-        apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
-    assert np.max(apart) < 4
-    # Neither are they far too large.
-    assert np.max(apart) > 0.3
+    """Standard errors are neither too small nor far too large."""
+    size = "ensemble.members=16", "ensemble.periods=32", "ensemble.settle_periods=24"
+    found = [numbers(averaged(*CHAOTIC, *size, f"ensemble.seed={seed}")) for seed in range(5)]
+    apart = [
+        np.abs(first - second) / np.hypot(by_first, by_second)
+        for (first, by_first), (second, by_second) in itertools.combinations(found, 2)
+    ]
+    assert 0.3 < np.max(apart) < 4

@@ -24,7 +24,7 @@ from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import lost
 from rootsopt.response.sweeps.scenes import Points
-from tests.optimize.test_checkpoint import evaluation
+from tests.optimize.test_optimize import evaluation
 
 ROW = lost(Status.INVALID) | {"response": {"mean_force_N": 0.1 + 0.2, "peak_force_N": float("nan")}}
 SPEED = "scene.speed_rpm"

@@ -1,4 +1,4 @@
-"""Averages of an ensemble's members, and their errors, from motions made up for the test."""
+"""Averages of an ensemble's members and columns of a series, from motions made up for the test."""
 
 import types
 
@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.dynamics.flow import Period
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.response import ensemble, together
+from rootsopt.response import ensemble, records, together
 from rootsopt.response.together import Members
+from rootsopt.view import files
 from tests.standins import oscillator
 
 
@@ -122,3 +124,33 @@ def test_slopes_and_errors_per_config_unit():
         scatter = np.std(moved, axis=1)
         np.testing.assert_allclose(errors[k], scatter, rtol=0.03)
         assert np.all(np.abs(found[k] - np.mean(moved, axis=1)) < 5 * scatter / 200)
+
+
+# Series
+
+
+def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
+    """The drive flank's force of the contact is in the file's drive column."""
+    count = 5
+    tau, states = np.arange(count) / count, np.zeros((count, 2))
+    one = np.arange(1.0, count + 1)
+    contact = FlankForce(
+        drive=one, coast=10 * one, depth=2 * one, lever2=5 * one, torque1=6 * one, torque2=7 * one,
+    )  # fmt: skip
+    physical = 0.2 * one, 0.3 * one
+    monkeypatch.setattr(
+        records, "contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
+    )
+    columns = files.response_columns(records.series_of(oscillator(), tau, states))
+    expected = {
+        "time_s": 0.02 * tau,
+        "rotation_deg": 120 * tau,  # three lobes
+        "relative_rotation_rad": 0.2 * one,
+        "relative_speed_rad_s": 0.3 * one,
+        "drive_flank_force_N": one,
+        "coast_flank_force_N": 10 * one,
+        "contact_force_N": 11 * one,
+    }
+    assert list(columns) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_allclose(columns[name], values, rtol=1e-14, err_msg=name)

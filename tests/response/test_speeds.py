@@ -23,7 +23,6 @@ WEIGHTS = "objective.speed_weights=[3, 1]"
 WORST = "objective.over_speeds=worst"
 TIGHT = "solver.rtol=1e-10"
 POINT = np.array([0.2, 0.3, 0.4])
-ROW = "speed_rpm", "status", "peak_force_N"
 
 
 def config_of(*overrides):
@@ -80,7 +79,9 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
         assert part.evaluation.gradient == single.gradient != {}
     # The evaluator is left at the scene's speed.
     assert float(evaluator.scene.speed) == pytest.approx(100 * np.pi)
-    rows = [[row[key] for key in ROW] for row in found.record()["speeds"]]
+    rows = [
+        [row["speed_rpm"], row["status"], row["peak_force_N"]] for row in found.record()["speeds"]
+    ]
     assert rows == [
         [speed, "periodic", alone[speed].response["peak_force_N"]] for speed in (2000, 3000, 4000)
     ]
@@ -121,8 +122,9 @@ def test_slope_agrees_with_central_differences(baseline, moved):
 
 def test_each_speed_begins_on_its_own_orbit(baseline, moved):
     evaluator, found, _ = baseline
-    reached = Evaluator.reached
-    with mock.patch.object(Evaluator, "reached", autospec=True, side_effect=reached) as spy:
+    with mock.patch.object(
+        Evaluator, "reached", autospec=True, side_effect=Evaluator.reached
+    ) as spy:
         again = evaluator(start=found.start, series=False)
     asked = [call.args[2] for call in spy.call_args_list]
     for start, new, old in zip(asked, again.speeds, found.speeds, strict=True):

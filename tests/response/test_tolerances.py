@@ -1,18 +1,23 @@
-"""Scatter of scene and design: config, samples, scenes, evaluator."""
+"""Scatter of scene and design: config, samples, scenes, evaluator, combined objectives."""
 
 import dataclasses
+import pickle
 from unittest import mock
 
 import jax
 import numpy as np
 import pytest
 import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats.mstats import hdquantiles
 
 from rootsopt import Scene, Status
 from rootsopt.config import load, parse
-from rootsopt.config.tolerances import scatterable
+from rootsopt.config.tolerances import TolerancesConfig, scatterable
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import plain_evaluation, read_evaluation
+from rootsopt.response.reducers import combine
 from rootsopt.response.scatter import draw, quantiles, shifts
 from tests.standins import evaluation_of, programs, refusal
 
@@ -20,9 +25,11 @@ CIC = "configs/cic_drawn.yaml"
 PLAY = "contact.clearance_mm=0.01"
 CLEARANCE = "tolerances.over.contact.clearance_mm.normal=0.002"
 BACKLASH = "tolerances.over.scene.timing_gear.backlash_mm.uniform=0.02"
-LOAD = "tolerances.over.scene.load.torque_N_m.relative_triangular=0.05"
-TIP = "tolerances.over.profile.tip_arc_angle_deg.normal=0.02"
-SPREAD = (PLAY, CLEARANCE, BACKLASH, LOAD, TIP)
+SPREAD = (
+    *(PLAY, CLEARANCE, BACKLASH),
+    "tolerances.over.scene.load.torque_N_m.relative_triangular=0.05",
+    "tolerances.over.profile.tip_arc_angle_deg.normal=0.02",
+)
 
 
 def config_of(*overrides, file=CIC):
@@ -130,6 +137,53 @@ def test_samples_have_the_statistics_of_their_distributions():
     assert not np.any(draw(config, 8, True) == draw(config, 8))
 
 
+# Combined objectives of many scenes, against SciPy and differences
+
+
+def rule(**settings) -> TolerancesConfig:
+    over = {"contact.clearance_mm": {"normal": 0.002}}
+    return TolerancesConfig.model_validate({"over": over, **settings})
+
+
+VALUES = np.array([1.02, 0.71, 0.93, 1.41, 0.88, 1.07, 0.79])
+RULES = {
+    "mean + 2 sigma": (rule(), np.mean(VALUES) + 2 * np.std(VALUES)),
+    "mean + 0.5 sigma": (rule(k=0.5), np.mean(VALUES) + 0.5 * np.std(VALUES)),
+    "quantile": (rule(combine="quantile"), hdquantiles(VALUES, 0.95)[0]),
+    "median": (rule(combine="quantile", quantile=0.5), hdquantiles(VALUES, 0.5)[0]),
+    "worst": (rule(combine="worst"), 1.41),
+}
+"""Rules, and what NumPy and SciPy find by them."""
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_weights_are_the_gradient(name):
+    """The weights agree with central differences.
+
+    The error of these is the third derivative times step²/6, about 1e-10, plus rounding 1e-16 /
+    step."""
+    one, expected = RULES[name]
+    found = combine(one, VALUES)
+    step = 1e-5
+    assert found.value == pytest.approx(expected, rel=1e-12)
+    for weight, moved in zip(found.weights, step * np.eye(len(VALUES)), strict=True):
+        upper, lower = (combine(one, VALUES + sign * moved).value for sign in (1, -1))
+        assert weight == pytest.approx((upper - lower) / (2 * step), abs=1e-8)
+
+
+@given(st.lists(st.floats(0.1, 10), min_size=2, max_size=40))
+def test_worst_quantile_median_in_order(values):
+    worst, high, middle = (combine(RULES[k][0], values) for k in ("worst", "quantile", "median"))
+    slack = 1e-12 * max(values)
+    assert worst.value + slack >= high.value >= middle.value - slack
+    for one, _ in RULES.values():
+        assert np.sum(combine(one, values).weights) == pytest.approx(1, abs=1e-12)
+        assert combine(one, [values[0]] * 5).value == pytest.approx(values[0], rel=1e-13)
+
+
+# Scenes of a sample
+
+
 @pytest.mark.parametrize("file", [CIC, "configs/pump.yaml"])
 def test_shifted_scenes_are_the_scenes_of_moved_configs(file):
     """Each value that may scatter, moved by 1 %, gives the scene of the moved config."""
@@ -175,8 +229,9 @@ def test_parts_are_the_evaluations_of_moved_configs(spread):
 
 def test_scenes_begin_on_their_own_orbits(spread):
     evaluator, found = spread
-    reached = Evaluator.reached
-    with mock.patch.object(Evaluator, "reached", autospec=True, side_effect=reached) as spy:
+    with mock.patch.object(
+        Evaluator, "reached", autospec=True, side_effect=Evaluator.reached
+    ) as spy:
         again = evaluator(start=found.start, series=False)
     asked = {id(call.args[2]) for call in spy.call_args_list}
     assert asked == {id(part.evaluation.start) for part in found.scenes}
@@ -213,18 +268,38 @@ def test_a_scene_without_steady_state_is_a_status():
     assert (found.status, found.samples) == (Status.NOT_SETTLED, ())
 
 
+class Away:
+    """Runs points as if in another process: what a point refers to must travel."""
+
+    slots = 2
+
+    def __init__(self):
+        self.asked = []
+
+    def evaluated(self, point):
+        self.asked.append(point)
+        evaluator, *rest = pickle.loads(pickle.dumps(point))
+        return evaluator(*rest)
+
+
 def test_scatter_over_several_speeds():
-    """Each scene is evaluated at every speed.
+    """Each scene is evaluated at every speed, where `runs` says, and as in this process.
 
     Methods that return another evaluator keep the sample."""
     narrow = "tolerances.over.contact.clearance_mm.uniform=0.001"
     evaluator = told(narrow, "objective.speeds_rpm=[2000, 3000]", "tolerances.samples=2")
-    found = evaluator()
+    runs = Away()
+    found = evaluator.surveying().scattered(runs)()
+    assert [point.series for point in runs.asked] == [False, False]
+    rows = [[part.evaluation.response for part in one.scenes] for one in (found, evaluator())]
+    assert rows[0] == rows[1]
     assert [len(start) for start in found.start] == [2, 2, 2]
     for part in found.samples:
         assert [p.speed_rpm for p in part.evaluation.speeds] == [2000, 3000]
         forces = [p.evaluation.response["mean_force_N"] for p in part.evaluation.speeds]
         assert forces == pytest.approx([1e3 * part.values["contact.clearance_mm"]] * 2, rel=1e-12)
+        speeds = [p.evaluation.start[1] for p in part.evaluation.speeds]
+        np.testing.assert_allclose(speeds, [200 * np.pi / 3, 100 * np.pi])
     again = read_evaluation(plain_evaluation(found))
     assert again.samples[1].evaluation.speeds[0].speed_rpm == 2000
     lone = evaluator.at_speed(2500.0)

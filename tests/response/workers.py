@@ -6,10 +6,8 @@ import os
 import signal
 import time
 
-import numpy as np
-
-from rootsopt import InputError, Status
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt import InputError
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sweeps import points
 
 DEADLY = 666.0
@@ -29,12 +27,8 @@ def check(config):
 
 
 def evaluation(self, design=None, start=None, series=True):
-    """Stand in for an evaluation."""
+    """Stand in for an evaluation, of which nothing is read."""
     work(self.config)
-    named = dict(zip(self.keys, map(float, design), strict=True))
-    force = float(np.sum(design) / 3)
-    return Evaluation(named, {}, {"mean_force_N": force}, {}, {}, Status.PERIODIC, "", {},
-                      None, np.asarray(design))  # fmt: skip
 
 
 if os.environ.get("TEST_SECONDS"):

@@ -170,11 +170,6 @@ def _margin(tau, z):
     return z[0] - 0.4 * z[1] + 0.7 * tau
 
 
-@jax.jit
-def _stepped(elements, lines, columns):
-    return chained(elements, lines, columns, condensed(elements, lines, columns))
-
-
 def _misses(unknown):
     """Return the residuals of the equations of the used elements, written one by one."""
     z = unknown[: USED * STATES].reshape(USED, STATES)
@@ -211,7 +206,8 @@ def test_newton_step_solves_the_dense_equations():
         bend=bend(tau[:, -1], z[:, -1]),
     )
     nothing = jnp.zeros((6, POINTS + 1, STATES + 1, 0))
-    step = _stepped(elements, lines, columns_of(elements, lines, nothing))
+    known = elements, lines, columns_of(elements, lines, nothing)
+    step = jax.jit(lambda *known: chained(*known, condensed(*known)))(*known)
     unknown = jnp.concatenate([state[:USED].ravel(), slopes[:USED].ravel(), TIMES[1:2]])
     expected = np.linalg.solve(jax.jit(jax.jacfwd(_misses))(unknown), -jax.jit(_misses)(unknown))
     found = np.concatenate(

@@ -84,15 +84,12 @@ class _Stop(Part):
     stop: Array | float
 
     def torque_on_2(self, motion, own):
-        del own
         return -2e4 * jnp.minimum(motion.relative + self.stop, 0.0)
 
     def switches(self, motion, own):
-        del own
         return self._excess(motion) > 0
 
     def margins(self, motion, own):
-        del own
         return self._excess(motion)
 
     def _excess(self, motion):
