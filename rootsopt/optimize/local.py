@@ -164,8 +164,8 @@ def certify(local: Linearization, point: NDArray[np.float64]) -> Certificate:
     `local`: objective and constraints at the point, with gradients."""
     from scipy.optimize import nnls  # Slow import (0.3 s).
 
-    size, apart = len(point), [group.top - group.values for group in local.groups]
-    branches = [(gap <= NEAR, g.slopes, gap) for gap, g in zip(apart, local.groups, strict=True)]
+    size, gaps = len(point), [group.top - group.values for group in local.groups]
+    branches = [(gap <= NEAR, g.slopes, gap) for gap, g in zip(gaps, local.groups, strict=True)]
     long = np.linalg.norm(local.normals, axis=1) > _NEGLIGIBLE
     limits = [
         ((local.slack <= NEAR) & long, -local.normals, np.maximum(local.slack, 0.0)),
