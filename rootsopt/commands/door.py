@@ -141,6 +141,10 @@ class _Stream:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
 
+    def writelines(self, lines) -> None:
+        for line in lines:
+            self.write(line)
+
     def flush(self) -> None:
         """Flush the stream, without raising an `OSError`."""
         if not self.closed_early:
