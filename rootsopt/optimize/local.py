@@ -185,7 +185,7 @@ def certify(local: Linearization, point: NDArray[np.float64]) -> Certificate:
     wanted = np.concatenate([-local.slope, np.zeros(len(gap)), np.full(len(counts), _WEIGHT)])
     solution = nnls(matrix, wanted)[0] if matrix.shape[1] else np.zeros(0)
     shares = []
-    for active, count in zip((active for active, _, _ in branches), counts, strict=True):
+    for (active, _, _), count in zip(branches, counts, strict=True):
         part, solution = solution[:count], solution[count:]
         total, share = np.sum(part), np.zeros(len(active))
         share[active] = part / total if total > 0 else 1 / count

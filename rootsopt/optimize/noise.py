@@ -200,14 +200,11 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
     """Return the trial at the best of the `candidates`, or `None` without candidates."""
-    best = candidates(problem, trials)[:1]
-    at_best = (
-        trial
-        for _, point in best
-        for trial in trials
-        if trial.candidate and np.array_equal(trial.point, point)
-    )
-    return next(at_best, None)
+    designs = candidates(problem, trials)
+    if not designs:
+        return None
+    _, point = designs[0]
+    return next(t for t in trials if t.candidate and np.array_equal(t.point, point))
 
 
 def message(record: dict[str, Any]) -> str:

@@ -324,13 +324,13 @@ class Assumed:
         known = np.isfinite(values)
         some, ends = values[drawn & known], [x for x in values[~drawn][1:] if math.isfinite(x)]
         worst = int(np.nanargmax(values)) if known.any() else None
-        ends_of = "objective_low", "objective_high"
-        rows = [
-            span._asdict()
-            | dict(zip(ends_of, self._ends(values, k), strict=True))
-            | {"worse": self.worse[span.key], "rank_correlation": self._rank(values, span.key)}
-            for k, span in enumerate(self.spans)
-        ]
+        rows = []
+        for k, span in enumerate(self.spans):
+            low, high = self._ends(values, k)
+            rows.append({
+                **span._asdict(), "objective_low": low, "objective_high": high,
+                "worse": self.worse[span.key], "rank_correlation": self._rank(values, span.key),
+            })  # fmt: skip
         return {
             "scenes": int(np.sum(drawn)),
             "compared": int(some.size),

@@ -320,8 +320,6 @@ def per_config_unit(
 
 
 _pair = CachedFunction(Scene.pair_and_shape)
-
-
 _point = CachedFunction(Space.point)
 
 

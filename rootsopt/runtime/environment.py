@@ -315,9 +315,11 @@ def _check_flags(flags: str) -> None:
             f"{shown}: {unsound[1]} assumes that neither NaN nor infinity occurs, and results may "
             f"be wrong without notice; {advice}"
         )
+    if not sys.executable:
+        return
     try:
         done = subprocess.run(
-            [sys.executable or "", "-c", _TRIAL],
+            [sys.executable, "-c", _TRIAL],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_TRIAL_SECONDS,

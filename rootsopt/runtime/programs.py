@@ -351,18 +351,21 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 
 def _loaded(place: _Place | None) -> _Made | None:
     """Return the cached program at `place`, or `None` if no program can be loaded from it."""
-    if place is not None:
-        with contextlib.suppress(Exception):
-            # Without an entry there is nothing to decompress, which is an error, too.
-            data = place.store.read(place.name, place.purpose) or b""
-            payload, number, result_shape = pickle.loads(zlib.decompress(data))
-            results = sum(map(_is_array, jax.tree.leaves(result_shape)))
-            takes = jax.tree.structure(((0,) * number, {}))
-            call = serialize_executable.deserialize_and_load(
-                payload, takes, jax.tree.structure([0] * results)
-            )
-            return _Made(call, result_shape)
-    return None
+    if place is None:
+        return None
+    try:
+        data = place.store.read(place.name, place.purpose)
+        if data is None:
+            return None
+        payload, number, result_shape = pickle.loads(zlib.decompress(data))
+        results = sum(map(_is_array, jax.tree.leaves(result_shape)))
+        takes = jax.tree.structure(((0,) * number, {}))
+        call = serialize_executable.deserialize_and_load(
+            payload, takes, jax.tree.structure([0] * results)
+        )
+    except Exception:
+        return None
+    return _Made(call, result_shape)
 
 
 def _modules(kind: _Kind) -> set[str]:
