@@ -1,4 +1,4 @@
-"""Config sections for studies of several scenes, or of several terms of an objective.
+"""Config sections for studies of several scenes, or of several objectives.
 
 The section `tolerances` states how values of scene and design scatter in manufacture, `assumptions`
 the ranges of assumed values of a pump's operation, and `pareto` the terms of a trade-off."""

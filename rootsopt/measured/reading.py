@@ -330,10 +330,11 @@ def _unit(points, unit: str | None, sought: Sought | None) -> str | None:
     """Return advice on the unit in which the `points` would fit the pitch radius, or `None`.
 
     `unit`, `sought`: as in `read`."""
-    known = None if unit or sought is None else sought.pitch_radius_mm
+    if unit is not None or sought is None or sought.pitch_radius_mm is None:
+        return None
     with np.errstate(all="ignore"):
         radius = np.abs(points - np.mean(points))
-        fitting = known and unit_of_size(float(np.max(radius) + np.min(radius)) / 2, known)
-    if not fitting:
-        return None
-    return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"
+        middle = float(np.max(radius) + np.min(radius)) / 2
+    if fitting := unit_of_size(middle, sought.pitch_radius_mm):
+        return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"
+    return None

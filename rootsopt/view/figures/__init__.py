@@ -33,7 +33,7 @@ def chosen(text: str) -> tuple[str, ...]:
     installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
-    names = {"none": (), "all": FORMATS}.get(",".join(names), names)
+    names = FORMATS if names == ("all",) else () if names == ("none",) else names
     if unknown := [name for name in names if name not in FORMATS]:
         raise InputError(
             f"`--export` must be formats out of {', '.join(FORMATS)}, or all, or none, but "

@@ -106,7 +106,8 @@ def _comparison(folder, designs, outlines, config):
     lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
     series = {name: one.series for name, one in designs.items() if one.series is not None}
     made, axes = figure(12, 4.8, 1, 1 + bool(series))
-    plot_departure(axes[0, -1], *outlines.values(), lobes, radius)
+    before, after = outlines.values()
+    plot_departure(axes[0, -1], before, after, lobes, radius)
     if series:
         periods = [one.steady_state.get("period") or lobes for one in designs.values()]
         plot_forces_together(axes[0, 0], series, 2 * np.pi / lobes * min(max(periods), lobes))
