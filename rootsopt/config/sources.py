@@ -92,8 +92,8 @@ _SUFFIX = ".yaml"
 @functools.cache
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped configs by name, such as "cic"."""
-    found = (sorted(place.glob(f"*{_SUFFIX}")) for place in _PLACES)
-    return {path.stem: path for path in next(filter(None, found), [])}
+    folders = (sorted(place.glob(f"*{_SUFFIX}")) for place in _PLACES)
+    return {path.stem: path for path in next(filter(None, folders), [])}
 
 
 def located(path: Path) -> Path:

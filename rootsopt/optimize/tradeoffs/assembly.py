@@ -172,8 +172,8 @@ class Selection(NamedTuple):
         other in `kept`."""
         known, values, points = {*self.kept}, self.values, self.points
         given = ([self.same[k] if self.same[k] >= 0 else k for k in pair] for pair in pairs)
-        found = itertools.pairwise(self.kept) if values.shape[1] == 2 else given
-        neighbours = dict.fromkeys((min(pair), max(pair)) for pair in found)
+        chosen = itertools.pairwise(self.kept) if values.shape[1] == 2 else given
+        neighbours = dict.fromkeys((min(pair), max(pair)) for pair in chosen)
         return [
             Edge(
                 (i, j),
