@@ -86,7 +86,7 @@ _OF = {
     "response/sweeps/scenes": "scenes",
     "optimize/tradeoffs/assembly": "tradeoffs",
     "optimize/tradeoffs/front": "tradeoffs cluster",
-    "optimize/tradeoffs/study": "tradeoffs",
+    "optimize/tradeoffs/study": "tradeoffs journal",
     "optimize/tradeoffs/trace": "tradeoffs",
 }
 """Modules, and the WORDs in the names `test_WORD.py` of their tests."""
