@@ -61,7 +61,7 @@ settings.load_profile("rootsopt")
 
 _LONGEST_FIRST = (
     *("identify", "response", "continuation", "steady", "tradeoffs", "robust", "improve"),
-    *("rattle", "leakage", "reserve", "basins", "play", "assumptions", "export", "optimize"),
+    *("rattle", "leakage", "reserve", "basins", "assumptions", "export", "optimize"),
     *("ensemble", "pages", "gradients", "known", "start", "outline", "families"),
 )
 """The first two share few programs: neither process repeats what the other compiles."""
