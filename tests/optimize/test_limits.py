@@ -219,7 +219,7 @@ def test_absent_limits_add_nothing():
         ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
         (["constraints.terms.mean_force_N.most=3"], "most"),
         (["constraints.terms.mean_force_N.max=.nan"], "constraints"),
-        # A term to be maximised belongs into a limit or a front.
+        # A term to be maximised belongs in a limit or in a front.
         (["objective.terms.area_efficiency=1"], "area_efficiency.*constraints.*pareto"),
     ],
 )

@@ -21,7 +21,8 @@ from tests.response.test_speeds import config_of
 PERIODIC = ("ensemble.members=4", "ensemble.settle_periods=48", "ensemble.periods=8")
 CHAOTIC = (
     "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}",
-    *("scene.load.torque_N_m=1", "objective.motion=ensemble"),
+    "scene.load.torque_N_m=1",
+    "objective.motion=ensemble",
 )
 INSIDE = (30.0, 4.0, 3.0)
 

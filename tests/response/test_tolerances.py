@@ -26,7 +26,9 @@ PLAY = "contact.clearance_mm=0.01"
 CLEARANCE = "tolerances.over.contact.clearance_mm.normal=0.002"
 BACKLASH = "tolerances.over.scene.timing_gear.backlash_mm.uniform=0.02"
 SPREAD = (
-    *(PLAY, CLEARANCE, BACKLASH),
+    PLAY,
+    CLEARANCE,
+    BACKLASH,
     "tolerances.over.scene.load.torque_N_m.relative_triangular=0.05",
     "tolerances.over.profile.tip_arc_angle_deg.normal=0.02",
 )
