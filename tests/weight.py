@@ -13,11 +13,11 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 26_468,
-    "statements of the tests": 14_557,
-    "statements of the experiments": 4_479,
+    "statements of the package": 25_917,
+    "statements of the tests": 14_164,
+    "statements of the experiments": 4_478,
     "packages": 13,
-    "files of the package": 199,
+    "files of the package": 197,
     "lines of the longest file": 450,
     "floors of packages": 10,
     "depth of imports": 22,
