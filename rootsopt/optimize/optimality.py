@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 _SAME = 1e-4, 0.03
 
 _REASONS = REASONS | {
-    "descent": (
-        "The descent has a step size and no test for an optimum: the design may be short of it."
-    ),
     "verification": (
         "The search found nothing better nearby, but the first-order conditions do not hold at the "
         "design: its gradients are less accurate than they ask for. If the objective depends on "

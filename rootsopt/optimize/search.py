@@ -199,7 +199,7 @@ class Search:
             )
         verification = self._verification()
         optimized, record = verification.confirmed(trials)
-        optimality = None if optimized is None else verification.optimality(optimized, trials)
+        optimality = None if optimized is None else verification.optimality(optimized)
         if optimality is not None and optimized is not None and bounding is not None:
             bound = bounding.bound(self.problem.objective(optimized))
             optimality = dataclasses.replace(optimality, bound=bound)

@@ -111,7 +111,7 @@ class Verification:
         for beside in self.problem.nearby(point, _BESIDE):
             yield self.exact, beside
 
-    def optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
+    def optimality(self, optimized: Evaluation) -> Optimality | None:
         """Return the first-order conditions at a verified design, and the outcomes of the starts.
 
         Return `None` if the design has no usable steady state."""
@@ -128,14 +128,14 @@ class Verification:
             if end is not None and (other := certify(end, point)).residual < RESIDUAL:
                 certificate, optimized = other, again
         ends = sorted(self.descents.items())
-        reason, promised = "verification" if ends else "descent", float("nan")
+        reason, promised = "verification" if ends else "interrupted", float("nan")
         beside = [end for _, end in ends if near(end.point, [point])]
         if beside:
             end = min(beside, key=lambda one: float(np.linalg.norm(one.point - point)))
             reason = judged(end.reason, certificate.holds(RESIDUAL, FEASIBLE))
             promised = end.promised
         held = self.problem.held_by(optimized, certificate)
-        starts = [self._outcome(number, end) for number, end in ends] or self._ends(trials)
+        starts = [self._outcome(number, end) for number, end in ends]
         rows = self._sensitivities(optimized, certificate)
         return Optimality(certificate, reason, promised, held, starts, rows)
 
@@ -179,20 +179,6 @@ class Verification:
             design=self.problem.named(end.point),
             point=end.point,
         )
-
-    def _ends(self, trials: list[Trial]) -> list[StartOutcome]:
-        """Return the outcomes of all descents, each with the best trial of the descent."""
-        starts: dict[int, list[Trial]] = {}
-        for trial in trials:
-            if trial.start >= 0:
-                starts.setdefault(trial.start, []).append(trial)
-        outcomes = []
-        for number, every in sorted(starts.items()):
-            best = min(filter(candidate, every), key=objective, default=every[0])
-            outcome = best.objective, best.residual, "descent", len(every)
-            design = self.problem.named(best.point)
-            outcomes.append(StartOutcome(number, *outcome, design, best.point))
-        return outcomes
 
 
 ERROR = 0.01

@@ -229,6 +229,21 @@ def test_a_search_stopped_before_it_found_anything():
     assert (result.optimized, result.history) == (None, [])
 
 
+def test_a_search_stopped_while_it_screens_says_why_it_ended():
+    stop = threading.Event()
+    radius = "objective={mean_weight: 0, peak_weight: 0, terms: {outer_radius_mm: 1}}"
+    settings = config("optimizer.screening=32", "optimizer.starts=1", radius)
+
+    def progress(done, expected, best):
+        if done == 30:
+            stop.set()
+
+    result = Search(settings, progress, stop).run()
+    assert (result.interrupted, result.improvement["objective"] > 0) == (True, True)
+    optimality = result.optimality.record()
+    assert (optimality["reason"], optimality["starts"]) == ("interrupted", [])
+
+
 @pytest.fixture
 def interruptible():
     """Let Ctrl-C raise, even if the tests were started with it ignored."""
