@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_904,
-    "statements of the tests": 14_177,
+    "statements of the package": 25_905,
+    "statements of the tests": 14_180,
     "statements of the experiments": 4_478,
     "packages": 13,
     "files of the package": 197,

@@ -22,7 +22,7 @@ from rootsopt.view.figures import runs
 from rootsopt.view.figures.designs import plot_departure, plot_forces_together
 from rootsopt.view.figures.force import amplitude_spectrum, plot_force, plot_gap
 from rootsopt.view.figures.style import figure
-from rootsopt.view.figures.sweep import MARKERS, sweep_figure
+from rootsopt.view.figures.sweep import MARKERS, status_entries, sweep_figure
 from rootsopt.view.files import ResultFolder
 from rootsopt.view.tables import scene_tables
 from tests.view.test_files_report_plot import failed, made_up
@@ -195,6 +195,16 @@ def test_statuses_are_in_every_figure(axes, options, panels, tmp_path):
     entries = [text.get_text() for one in figure.legends for text in one.get_texts()]
     told = {label for label in found if any(entry.startswith(label) for entry in entries)}
     assert found - told <= ({"periodic"} if panels == 4 else set())
+
+
+def test_the_legend_says_what_a_marker_without_a_steady_motion_shows():
+    entries = status_entries(["periodic", "not_closed", "inaccurate", "passed_through"])
+    assert [one.get_label() for one in entries] == [
+        "periodic",
+        "not closed, average of a window",
+        "inaccurate, no gradient",
+        "passed through, no force",
+    ]
 
 
 @pytest.mark.parametrize(

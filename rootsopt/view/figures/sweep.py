@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
+from rootsopt.dynamics.steady import CLOSED, OPEN
 from rootsopt.response.attractors import Attractor, Basins
 from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import Plan
@@ -66,11 +67,11 @@ def status_entries(statuses: Iterable[str], face: str = "black") -> list[Line2D]
     """Return legend entries for the markers of the `statuses`; `face`: colour of faces."""
     entries = []
     for status in dict.fromkeys(statuses):
-        words = in_words(status)
-        if status in ("chaotic", "not_settled"):
+        words, known = in_words(status), Status[status.upper()]
+        if known in OPEN:
             words += ", average of a window"
-        elif not Status[status.upper()].usable:
-            words += ", no force"
+        elif not known.usable:
+            words += ", no gradient" if known in CLOSED else ", no force"
         style: dict[str, Any] = {"marker": MARKERS[status], "markerfacecolor": face}
         entries.append(Line2D([], [], color="black", linestyle="", label=words, **style))
     return entries
