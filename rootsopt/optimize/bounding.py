@@ -412,7 +412,8 @@ class Bounding:
         tops, turned = zip(*[self._look(box.middle + step) for step in steps], strict=True)
         every = np.vstack([slack, *tops])
         high, low = np.fmax.reduce(every, axis=0), np.fmin.reduce(every, axis=0)
-        if np.any(2 * high - low < 0):
+        # Not as a difference: both can be infinite.
+        if np.any(2 * high < low):
             return None
         # A constraint may jump where a profile becomes unsound. Its tangents then say nothing.
         inside = np.min(np.nan_to_num(every, nan=-1.0), axis=1) >= -FEASIBLE
