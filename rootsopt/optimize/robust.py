@@ -320,8 +320,8 @@ def _joined(nominal: Optimization, outcome: Optimization, fresh, scenes) -> Opti
     `nominal`: outcome of the first stage; `fresh`, `scenes`: fields of `Robustness`."""
     count = len(nominal.history)
     rows = [row | {"evaluation": row["evaluation"] + count} for row in outcome.history]
-    begun = next((row["objective"] for row in rows), float("nan"))
-    robustness, history = Robustness(nominal, float(begun), fresh, scenes), nominal.history + rows
+    first = next((row["objective"] for row in rows), float("nan"))
+    robustness, history = Robustness(nominal, float(first), fresh, scenes), nominal.history + rows
     return dataclasses.replace(outcome, history=history, robustness=robustness)
 
 

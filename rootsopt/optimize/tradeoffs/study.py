@@ -242,8 +242,8 @@ class Study:
         orbit: Seeds = None,
     ) -> Evaluation:
         asked = Point(evaluator, self.problem.design(point), orbit)
-        begun = json.dumps(plain(orbit)).encode()
-        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
+        start = json.dumps(plain(orbit)).encode()
+        key = stage, hashlib.sha256(point.tobytes() + start).hexdigest()[:16]
         return self.checkpoint.evaluated(self.runs.evaluated, key, asked, point)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
