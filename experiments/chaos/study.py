@@ -68,7 +68,7 @@ QUICK = (
 # first more members, then more designs.
 SIZES = {
     False: SimpleNamespace(
-        line=17, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
+        line=13, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
         slopes=((16, 4), (16, 8), (16, 16), (32, 4), (64, 4), (128, 4))),
     True: SimpleNamespace(
         line=3, members=4, window=8, pathwise=8, large=16, groups=(4, 8), slopes=((8, 4),)),

@@ -11,7 +11,7 @@ STUDY = Study(
     quick="four pairs of one kind",
     published={"gradients.png": "gradients.png"},
     options={
-        "--count": {"type": int, "default": 120, "help": "pairs (default: 120)"},
+        "--count": {"type": int, "default": 100, "help": "pairs (default: 100)"},
         "--seed": {"type": int, "default": 0, "help": "seed of the draw (default: 0)"},
     },
     cache=False,

@@ -10,6 +10,6 @@ STUDY = Study(
     quick="two scenes, one noise",
     published={"identify.png": "identify.png"},
     options={
-        "--scenes": {"type": int, "metavar": "N", "help": "number of scenes (default: 30)"},
+        "--scenes": {"type": int, "metavar": "N", "help": "number of scenes (default: 20)"},
     },
 )

@@ -34,7 +34,7 @@ COLUMNS = "relative_rotation_rad", "contact_force_N"
 # Standard deviation of the noise, as a share of the RMS of the column.
 NOISES = 0.01, 0.03, 0.1
 SAMPLES = 180
-SCENES, STARTS = 30, 2
+SCENES, STARTS = 20, 2
 
 # Share of regions that must hold the true values.
 PROMISED = 0.9
