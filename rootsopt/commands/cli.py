@@ -303,7 +303,8 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     from rootsopt.view.pages.html import report_text
 
     try:
-        run = Run(folder, folder.result, options.given, outcome.usable, options.imports)
+        usable, rows = outcome.usable, outcome.rows
+        run = Run(folder, folder.result, options.given, usable, options.imports, rows)
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"

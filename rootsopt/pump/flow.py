@@ -147,10 +147,17 @@ def _mean(shape: Geometry) -> Float[Array, ""]:
 
 def play_of(scene: Scene, profile: Profile) -> Play:
     """Return the play in a `scene`, with all its clearances."""
+    return play(profile, **clearances_of(scene))
+
+
+def clearances_of(scene: Scene) -> dict[str, Float[Array, ""]]:
+    """Return the arguments of `play` (m) that a `scene` determines, by name."""
     error, medium = scene.center_distance_error, scene.medium
-    center_distance = 2 * scene.pitch_radius + (0.0 if error is None else error)
-    radial = jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
-    return play(profile, scene.clearance, center_distance, radial=radial)
+    return {
+        "clearance": scene.clearance,
+        "center_distance": 2 * scene.pitch_radius + (0.0 if error is None else error),
+        "radial": jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance,
+    }
 
 
 def critical_ratio(heat_ratio: Float[Array, ""]) -> Float[Array, ""]:

@@ -10,12 +10,14 @@ from jaxtyping import Array, Float
 from rootsopt.config.reading import Config
 from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
-from rootsopt.profiles import geometry
+from rootsopt.profiles import Profile, geometry
 from rootsopt.pump import flow
-from rootsopt.pump.flow import CM3, L_MIN, MRAD, play_of, ripple_of
+from rootsopt.pump.flow import CM3, L_MIN, MRAD, ripple_of
+from rootsopt.pump.gap import play
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
+from rootsopt.scene.check import profile_of
 from rootsopt.scene.reading import Medium, design_vector
 
 # Overlap (m) of the flanks below which it counts as rounding of an outline.
@@ -61,7 +63,9 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
         rows["static_bearing_load_max_N"] = float(jnp.max(greatest))
         rows["static_bearing_load_equivalent_N"] = float(jnp.max(equivalent))
     if _has_play(scene):
-        rows |= {key: value.tolist() for key, value in _play(scene, design).items()}
+        # The program takes no scene, so that scenes with other parts share it.
+        free = _play(profile_of(scene, design), flow.clearances_of(scene))
+        rows |= {key: value.tolist() for key, value in free.items()}
         if rows["flank_interference_um"] * UM <= _ROUNDING:
             del rows["flank_interference_um"], rows["flank_interference_at_deg"]
     if scene.medium is not None:
@@ -122,8 +126,9 @@ def missing(rows: Mapping[str, Any]) -> str:
 
 def check_clearances(config: Config) -> None:
     """Raise `InputError` if a config has a section `pump` and its flanks overlap."""
-    if config.pump is not None:
-        sheet(Scene.from_config(config), design_vector(config))
+    scene = Scene.from_config(config)
+    if scene.medium is not None:
+        _leaking(scene, scene.medium, design_vector(config))
 
 
 def record_of(config: Config, design: Sequence[float]) -> dict[str, Any]:
@@ -185,14 +190,14 @@ def _has_play(scene: Scene) -> bool:
 
 
 @CachedFunction
-def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
-    play = play_of(scene, scene.profile(design))
+def _play(profile: Profile, clearances: dict[str, Array]) -> dict[str, Array]:
+    free = play(profile, **clearances)
     return {
-        "angular_play_min_mrad": jnp.min(play.total) / MRAD,
-        "angular_play_max_mrad": jnp.max(play.total) / MRAD,
-        "gear_backlash_max_mm": play.gear_backlash / MM,
-        "flank_interference_um": play.overlap / UM,
-        "flank_interference_at_deg": play.overlap_at / DEG,
+        "angular_play_min_mrad": jnp.min(free.total) / MRAD,
+        "angular_play_max_mrad": jnp.max(free.total) / MRAD,
+        "gear_backlash_max_mm": free.gear_backlash / MM,
+        "flank_interference_um": free.overlap / UM,
+        "flank_interference_at_deg": free.overlap_at / DEG,
     }
 
 

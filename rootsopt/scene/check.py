@@ -66,11 +66,11 @@ def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.fl
 
     `design`: in config units, by default the config's own."""
     design = design_vector(config) if design is None else jnp.asarray(design)
-    profile = _profile(Scene.from_config(config), design)
+    profile = profile_of(Scene.from_config(config), design)
     return np.asarray(outline(profile, points=240)) / MM
 
 
-_profile = CachedFunction(Scene.profile)
+profile_of = CachedFunction(Scene.profile)
 
 
 # Number of sampled members. Number of searches that begin at the best of them. Magnitude (mm) that

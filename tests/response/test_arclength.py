@@ -51,17 +51,21 @@ def test_circle_is_closed_with_a_fold_on_either_side():
     np.testing.assert_allclose(np.hypot(x, p), 1, atol=1e-10)
     assert np.unwrap(np.arctan2(p, x))[-1] == pytest.approx(2 * np.pi, abs=0.2)
     assert [name for _, name, _ in path.crossings] == ["FOLD", "FOLD"]
-    found = [spot.place for _, _, spot in path.crossings]
-    np.testing.assert_allclose(found, [[0, 1], [0, -1]], atol=1e-8)
+    np.testing.assert_allclose(
+        [spot.place for _, _, spot in path.crossings], [[0, 1], [0, -1]], atol=1e-8
+    )
 
 
 def test_cubic_passes_both_folds_to_the_end_of_the_range():
     """λ = x - x³ has folds at x = ±1/√3."""
     path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
     assert (path.end, path.spots[-1].place[-1]) == (End.RANGE_END, -1.5)
-    folds = [spot.place for _, _, spot in path.crossings]
     top = 1 / np.sqrt(3)
-    np.testing.assert_allclose(folds, [[-top, -top + top**3], [top, top - top**3]], atol=1e-8)
+    np.testing.assert_allclose(
+        [spot.place for _, _, spot in path.crossings],
+        [[-top, -top + top**3], [top, top - top**3]],
+        atol=1e-8,
+    )
     assert all(spot.tangent @ after.tangent > 0.9 for spot, after in itertools.pairwise(path.spots))
     assert len({spot.orientation for spot in path.spots}) == 1
     for index, _, spot in path.crossings:
@@ -83,13 +87,15 @@ def test_ends_are_named():
     assert (few.end, len(few.spots)) == (End.MAX_POINTS, 7)
 
     def until(guess, across, near):
-        if guess[-1] > 0.5:
+        spot = CIRCLE(guess, across, near)
+        if spot.place[-1] > 0.5:
             raise StoppedError(End.TOO_DEEP)
-        return CIRCLE(guess, across, near)
+        return spot
 
-    path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2), {})
-    assert path.end is End.TOO_DEEP
-    assert path.spots[-1].place[-1] == pytest.approx(0.5, abs=1e-4)
+    for least in (1e-6, 1e-3):
+        path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, least=least), {})
+        assert (path.end, path.crossings) == (End.TOO_DEEP, [])
+        assert path.spots[-1].place[-1] == pytest.approx(0.5, abs=2 * least)
     outward = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-1, 0), {})
     assert (outward.end, len(outward.spots)) == (End.RANGE_END, 1)
 
@@ -99,8 +105,7 @@ def test_a_corner_is_passed():
     recorded."""
     roof = curve_of(lambda x, p: p + abs(x), lambda x, p: [np.sign(x), 1.0])
     path = follow_curve(roof, start_of(roof, -1.0, -1.0), StepSizes(-2, 1), FOLD)
-    assert path.end is End.RANGE_END
-    assert path.spots[-1].place == pytest.approx([2.0, -2.0])
+    assert (path.end, path.spots[-1].place) == (End.RANGE_END, pytest.approx([2.0, -2.0]))
     assert [name for _, name, _ in path.crossings] == ["CORNER", "FOLD"]
     assert path.crossings[1][2].place == pytest.approx([0, 0], abs=1e-3)
 

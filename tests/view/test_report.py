@@ -22,14 +22,12 @@ from rootsopt.status import Status
 from rootsopt.view import pages, tables, terminal
 from rootsopt.view.files import ResultFolder, response_columns
 from rootsopt.view.pages import charts
-from rootsopt.view.pages.charts import animations
 from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
 from tests.commands.test_pareto import FEW
 
 CIC = "cic_drawn"
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
-NOTE = "`rotor.helix_deg` is 1 °, which is unusual"
 SAMPLES, PITCHES = 240, 3
 
 
@@ -44,13 +42,12 @@ def motion():
     return Series(phase / (300 * np.pi), phase / 3, none - 1e-3, none, force, none, none)
 
 
-def run_of(place, result, series=None, source="cic", usable=True):
-    """Return a run whose files lie in `place`."""
+def run_of(place, result, series=None, source="cic", usable=True, rows=()):
     folder = ResultFolder(place)
     folder.write_text("config.yaml", load(CIC).to_yaml())
     if series is not None:
         folder.write_csv("response_design.csv", response_columns(series))
-    return Run(folder, result, source, usable)
+    return Run(folder, result, source, usable, rows=rows)
 
 
 def result_of(command="simulate", **more):
@@ -76,7 +73,8 @@ def simulated(tmp_path_factory):
     """Return a run with a motion, whose command line and status name are hostile."""
     place = tmp_path_factory.mktemp("run")
     ResultFolder(place).write_bytes("figures/force.png", b"\x89PNG")
-    result = result_of(message=f"Settled. {HOSTILE}", notes=[NOTE])
+    note = "`rotor.helix_deg` is 1 °, which is unusual"
+    result = result_of(message=f"Settled. {HOSTILE}", notes=[note])
     return run_of(place, result, motion(), source=HOSTILE)
 
 
@@ -93,7 +91,6 @@ def words_of(page):
 
 
 def report_of(*arguments, **more):
-    """Return the words of the report of a run."""
     return words_of(report_text(run_of(*arguments, **more)))
 
 
@@ -103,15 +100,13 @@ def data_of(page):
 
 
 def test_page_opens_without_a_network(page):
-    """Nothing is loaded, and the page forbids its own scripts to load anything."""
+    """Nothing is loaded, and the page forbids its own scripts to load anything.
+
+    The text of a run is no markup."""
     markup = re.sub(r"<script>.*?</script>", "", page, flags=re.S)
     assert not re.search(r"<(script|link|iframe)[^>]*(src|href)=", markup)
-    sources = {source[:22] for source in re.findall(r'src="([^"]*)', markup)}
-    assert sources == {"data:image/png;base64,"}
+    assert {*re.findall(r'src="([^"]{,22})', markup)} == {"data:image/png;base64,"}
     assert "default-src 'none'" in markup
-
-
-def test_text_of_a_run_is_no_markup(page):
     assert HOSTILE not in page
     assert page.count("<script") == page.count("</script>") == 3
     assert words_of(page).count('document.title = "taken"') >= 2
@@ -176,7 +171,7 @@ def test_run_without_a_result_says_why(tmp_path):
     status = Status.PASSED_THROUGH
     bare = {"response": {}, "gradient": {}, "steady_state": {"kind": "transient"}}
     message = message_of(load(CIC), status)
-    given = result_of(status=status.label, message=message, **bare)
+    given = result_of(status=status.label, message=message) | bare
     page = report_text(run_of(tmp_path, given, usable=False))
     text, data = words_of(page), data_of(page)
     assert "Passed through: The lobes passed through each other" in text
@@ -217,18 +212,15 @@ def test_header_marks_a_result_that_is_not_to_be_trusted(status, usable, mark, t
      ("pareto", "cic", "cic --resume")],
 )  # fmt: skip
 def test_stopped_run_says_how_to_go_on(command, source, resumed, tmp_path):
+    """A search that is stopped before anything is known has neither design nor numbers."""
     message = "The search was stopped after 2 designs. The best of them is reported."
     given = result_of(command, status="interrupted", message=message)
+    if command == "optimize":
+        known = "status", "message", "versions", "run"
+        given = {"baseline": None, "optimized": None} | {key: given[key] for key in known}
     text = report_of(tmp_path, given, source=source, usable=False)
     assert f"Interrupted: {message}" in text
     assert f"Go on from where it stopped: rootsopt {command} {resumed}" in text
-
-
-def test_stopped_run_has_a_report(tmp_path):
-    """A run stopped before anything was known has neither design nor numbers."""
-    given = {"baseline": None, "optimized": None, "status": "interrupted", "versions": {},
-             "message": "Stopped.", "run": {"command": "optimize"}}  # fmt: skip
-    assert "Interrupted: Stopped." in report_of(tmp_path, given, usable=False)
 
 
 def test_optimum_is_reported_in_the_users_words(tmp_path):
@@ -250,14 +242,8 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
              "constraints": [limit], "optimality": optimality, "status": "periodic",
              "message": "Found.", "run": {"command": "optimize"}}  # fmt: skip
     text = report_of(tmp_path, given)
-    for words in (
-        "area efficiency ≥ 0.43",
-        "−2.63 % for −0.01",
-        "About 100 % of further starts",
-        "displaced volume (cm³) 541.70 541.70 0.00 %",
-        "flow lines, 2 of 2 0.010000",
-    ):
-        assert words in text
+    assert "About 100 % of further starts" in text
+    assert "displaced volume (cm³) 541.70 541.70 0.00 %" in text
     # The terminal shows the same tables, with the same facts.
     console = Console(width=80, file=io.StringIO(), record=True)
     shown = tables.tables_of(given)
@@ -274,19 +260,17 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
 @pytest.mark.parametrize("command", ["optimize", "simulate", "profile"])
 def test_advice_names_the_config_of_the_result(command, tmp_path):
     """Each file in an advised command can be read and holds the design that the page is about."""
-    before, given = load(CIC), result_of(command)
-    after = before.with_design([37.0, 8.0, 4.5])
+    config, given = load(CIC), result_of(command)
     if command == "optimize":
-        design = dict(zip(after.design_keys, after.design, strict=True))
+        config = config.with_design([37.0, 8.0, 4.5])
+        design = dict(zip(config.design_keys, config.design, strict=True))
         given = {"baseline": given, "optimized": result_of(design=design), "message": "Found.",
                  "status": "periodic", "run": {"command": command}}  # fmt: skip
+        (tmp_path / "optimized.yaml").write_text(config.to_yaml())
     run = run_of(tmp_path, given)
-    (tmp_path / "optimized.yaml").write_text(after.to_yaml())
-    named = {shlex.split(step)[2] for _, step in run.end.steps}
     assert len(run.end.steps) >= 2
-    expected = after if command == "optimize" else before
-    for file in named:
-        np.testing.assert_array_equal(load(file).design, expected.design)
+    for _, step in run.end.steps:
+        np.testing.assert_array_equal(load(shlex.split(step)[2]).design, config.design)
 
 
 def test_sweep_over_two_quantities(tmp_path):
@@ -298,12 +282,7 @@ def test_sweep_over_two_quantities(tmp_path):
     ]  # fmt: skip
     rows[0] |= {"mean_force_N": None, "peak_force_N": None, "status": "passed_through"}
     rows[2] |= {"status": "averaged", "rms_force_N": float("nan")}
-    keys = [*rows[0], "rms_force_N"]
-    ResultFolder(tmp_path).write_csv(
-        "sweep.csv", {key: np.array([row.get(key) for row in rows], object) for key in keys}
-    )
-    run = run_of(tmp_path, result_of("sweep", status="chaotic"))
-    assert {row["rms_force_N"] for row in run.rows} == {None}
+    run = run_of(tmp_path, result_of("sweep", status="chaotic"), rows=rows)
     text = words_of(report_text(run))
     assert "3 of 6 scenes have a steady state." in text
     assert "these differ: speed: 1000 rpm, 3000 rpm and 2000 rpm; backlash: 0.1 mm and 0.2" in text
@@ -319,8 +298,8 @@ def test_command_writes_a_report_of_a_run_without_a_result(tmp_path, capsys):
     assert (result["points"], pages.REPORT in result["run"]["files"]) == ([], True)
     assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
     text = words_of((place / pages.REPORT).read_text("utf-8"))
-    for words in ("Infeasible: ", "Constraints in conflict", "seal width ≥ 25 mm"):
-        assert words in text
+    told = "Infeasible: ", "Constraints in conflict", "seal width ≥ 25 mm"
+    assert [words for words in told if words not in text] == []
 
 
 @pytest.mark.parametrize(
@@ -342,13 +321,10 @@ def test_missing_libraries_are_named(command, options, extra, tmp_path, monkeypa
 
 
 def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
-    def fail(run):
-        raise RuntimeError("no idea")
-
-    monkeypatch.setattr("rootsopt.view.pages.html.report_text", fail)
+    monkeypatch.setattr("rootsopt.view.pages.html.report_text", lambda run: 1 / 0)
     given = [CIC, "-o", str(tmp_path / "run"), "--report", "--no-figures", "--export", "none"]
     assert profile.main(given) == 0
-    assert "no idea" in capfd.readouterr().err
+    assert "division by zero" in capfd.readouterr().err
     assert {"result.json", pages.REPORT} & {*os.listdir(tmp_path / "run")} == {"result.json"}
 
 
@@ -362,7 +338,7 @@ def browsed(file, *options):
         *(*options, file.as_uri()),
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    told = re.findall(r"^.*CONSOLE.*$", done.stderr, re.M)
     return done.stdout, [line for line in told if "[bokeh" not in line]  # Bokeh's own work
 
 
@@ -434,7 +410,6 @@ def test_slider_moves_the_rotors_in_a_browser(page, tmp_path, width):
 
 
 def test_page_prints(page, tmp_path):
-    """The page prints as a PDF of several pages, with charts."""
     file = tmp_path / "page.html"
     file.write_text(page, "utf-8")
     _, told = browsed(file, f"--print-to-pdf={tmp_path / 'page.pdf'}")
@@ -447,5 +422,5 @@ def test_page_prints(page, tmp_path):
 def test_axes_are_drawn_where_they_are(simulated):
     """Two pitch radii of 33 mm and the error of the scene apart."""
     config = load(CIC, ["scene.center_distance_error_mm=0.25"])
-    found = animations([dataclasses.replace(simulated.cases[0], config=config, series=None)])
+    found = charts.animations([dataclasses.replace(simulated.cases[0], config=config, series=None)])
     assert found["rotors"][0]["center"] == 66.25

@@ -267,7 +267,7 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
         return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
 
     function = eqx.filter_closure_convert(function, *sliced(0))  # traced once
-    shapes = jax.eval_shape(function, *sliced(0))
+    shapes = function.out_struct
     nothing = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
     # The numbers of a pair enter the loop as one vector. XLA would copy each of them.
     numbers, rest = eqx.partition(function, eqx.is_inexact_array)

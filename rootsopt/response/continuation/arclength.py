@@ -191,7 +191,8 @@ def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | 
     """Return a point close to `old`, beyond a corner too sharp for a step to follow, or None.
 
     The point must lie ahead of `old`: its tangent, with the orientation of the tangent at `old`,
-    must point away from `old`.
+    must point away from `old`. If it has hardly turned, the point must be further away than the
+    last steps tried: otherwise it only shows that the curve goes on for less than these.
     """
     for size in _CORNER:
         for across in np.vstack([np.eye(len(old.place)), -np.eye(len(old.place))]):
@@ -204,7 +205,9 @@ def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | 
             moved = new.place - old.place
             within = steps.low <= new.place[-1] <= steps.high
             distance = np.linalg.norm(moved)
-            if within and distance < 5 * size and new.tangent @ moved > 0.5 * distance:
+            ahead = distance < 5 * size and new.tangent @ moved > 0.5 * distance
+            turned = new.tangent @ old.tangent < _TURN
+            if within and ahead and (turned or distance > 2 * steps.least):
                 return new
     return None
 

@@ -2,10 +2,8 @@
 
 The words are the run's task in sentences, and the glossary."""
 
-import csv
 import dataclasses
 import functools
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -45,12 +43,11 @@ class Run:
 
     `result`: content of the result file, which may not be written yet; `source`: arguments of the
     command as the user gave them; `usable`: whether the run ended with a usable result (exit code
-    0); `imports`: files and modules of `--import`.
+    0); `imports`: files and modules of `--import`; `rows`: rows of a sweep.
 
     `command`: name of the command; `path`: final path of the result folder; `config`: resolved
-    config, with its YAML as `yaml`; `cases`: designs and motions; `rows`: rows of a sweep's table;
-    `figures`: content of each PNG file by name; `end`: outcome and next commands, as on the
-    terminal.
+    config, with its YAML as `yaml`; `cases`: designs and motions; `figures`: content of each
+    PNG file by name; `end`: outcome and next commands, as on the terminal.
 
     Raises `InputError` if a config in the folder cannot be read."""
 
@@ -61,17 +58,17 @@ class Run:
         source: str,
         usable: bool,
         imports: Sequence[str] = (),
+        rows: Sequence[Mapping[str, Any]] = (),
     ):
-        place = folder.place
+        place, self.rows = folder.place, rows
         self.result, self.source, self.usable = result, source, usable
         self.command, self.path = str(result["run"]["command"]), folder.path
         self.config = load(place / "config.yaml")
         self.yaml = (place / "config.yaml").read_text("utf-8")
         self.cases = tuple(_cases(place, self.config, result))
-        self.rows = tuple(_rows(place / "sweep.csv"))
         pictures = sorted((place / "figures").glob("*.png"))
         self.figures = {path.name: path.read_bytes() for path in pictures}
-        self.end = ending(result, self.path, source, imports, self.rows)
+        self.end = ending(result, self.path, source, imports, rows)
 
 
 def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
@@ -86,26 +83,6 @@ def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[C
         series = _series(place, keys.get(name, name.removeprefix("motion ")))
         used = load(place / file) if chosen else config
         yield Case(name, used, dict(record.get("design", own)), record, series)
-
-
-def _rows(file: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table, with numbers as numbers and None for empty cells."""
-    if not file.exists():
-        return
-    with file.open(encoding="utf-8", newline="") as lines:
-        for row in csv.DictReader(lines):
-            yield {key: _read(text) for key, text in row.items()}
-
-
-def _read(text: str) -> Any:
-    """Return the value of a cell: a number, None if it is empty or not finite, or its text."""
-    try:
-        number = float(text)
-    except ValueError:
-        return text or None
-    if text.isdecimal():
-        return int(text)
-    return number if math.isfinite(number) else None
 
 
 def _series(place: Path, name: str) -> Series | None:
