@@ -80,7 +80,7 @@ def run_all(known: dict[str, tuple[str, Study]], options: argparse.Namespace) ->
         return done.returncode, f"{time.perf_counter() - began:8.0f} s  {said}"
 
     runs = [
-        (study.alone, (name, *more))
+        (study.alone is True or study.alone in more, (name, *more))
         for name, (_, study) in known.items()
         for more in ((), *study.further)
     ]

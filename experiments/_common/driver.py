@@ -36,8 +36,8 @@ class Study:
     result folder and its name in `docs/`; `options`: for each option of its own, the settings that
     `argparse` takes; `further`: options of further runs that `--all` makes; `cache`: whether
     compiled programs are kept between processes; `alone`: whether no other study may run beside
-    it, because it measures times by the clock or uses all cores. If `precision` is False, JAX is
-    not started: the study does that in its own processes.
+    it, because it measures times or uses all cores; or the option with which this holds. If
+    `precision` is False, JAX is not started: the study does that in its own processes.
     """
 
     quick: str
@@ -45,7 +45,7 @@ class Study:
     options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     further: tuple[tuple[str, ...], ...] = ()
     cache: bool = True
-    alone: bool = False
+    alone: bool | str = False
     precision: bool = True
 
 

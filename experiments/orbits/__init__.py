@@ -22,4 +22,5 @@ STUDY = Study(
     },
     further=(("--speed",),),
     cache=False,
+    alone="--speed",
 )
