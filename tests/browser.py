@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
+# Flags with which Chromium needs no display, and calls nobody.
 FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -22,7 +23,6 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-"""Flags with which Chromium needs no display, and calls nobody."""
 
 
 def chromium() -> str:
@@ -55,9 +55,9 @@ class Browser:
         started = next(line for line in self._process.stdout if "successfully on port" in line)
         self._base = f"http://127.0.0.1:{started.split()[-1].rstrip('.')}"
         wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
-        made = self._call("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
+        made = self.call("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/session/{made['sessionId']}"
-        self._call("POST", "/goog/cdp/execute", {
+        self.call("POST", "/goog/cdp/execute", {
             "cmd": "Browser.setDownloadBehavior",
             "params": {"behavior": "allow", "downloadPath": str(folder)},
         })  # fmt: skip
@@ -65,59 +65,24 @@ class Browser:
     def close(self) -> None:
         """End browser and driver."""
         with contextlib.suppress(OSError):
-            self._call("DELETE", "")
+            self.call("DELETE", "")
         self._process.terminate()
         self._process.wait(20)
 
-    def open(self, url: str) -> None:
-        """Load a page in the present tab."""
-        self._call("POST", "/url", {"url": url})
-
-    def tab(self) -> str:
-        """Open another tab, and return its handle."""
-        return self._call("POST", "/window/new", {"type": "tab"})["handle"]
-
-    def tabs(self) -> list[str]:
-        """Return the handles of all tabs."""
-        return self._call("GET", "/window/handles")
-
-    def switch(self, handle: str) -> None:
-        """Turn to the tab with this handle."""
-        self._call("POST", "/window", {"handle": handle})
-
     def run(self, code: str, *arguments: Any) -> Any:
         """Return what JavaScript `code` returns, with its `arguments` there."""
-        return self._call("POST", "/execute/sync", {"script": code, "args": list(arguments)})
+        return self.call("POST", "/execute/sync", {"script": code, "args": list(arguments)})
 
-    def wait(self, code: str, *arguments: Any, seconds: float = 60.0) -> Any:
-        """Run `code` until it returns something true, and return that."""
+    def wait(self, code: str, *arguments: Any, seconds: float = 60.0) -> None:
+        """Run `code` until it returns something true."""
         end = time.monotonic() + seconds
-        while not (found := self.run(code, *arguments)):
+        while not self.run(code, *arguments):
             if time.monotonic() > end:
                 raise TimeoutError(f"not within {seconds:g} s: {code}")
             time.sleep(0.05)
-        return found
 
-    def drag(self, x: float, y: float, dx: float) -> None:
-        """Press the mouse at (x, y), move it by `dx` pixels in steps, and let go."""
-        steps = [
-            {"type": "pointerMove", "x": round(x), "y": round(y), "duration": 0},
-            {"type": "pointerDown", "button": 0},
-            *(
-                {"type": "pointerMove", "x": round(x + k * dx / 5), "y": round(y), "duration": 30}
-                for k in range(1, 6)
-            ),
-            {"type": "pointerUp", "button": 0},
-        ]
-        pointer = {"type": "pointer", "id": "mouse", "actions": steps}
-        self._call("POST", "/actions", {"actions": [pointer]})
-
-    def console(self) -> list[str]:
-        """Return the messages on the console since the last call."""
-        told = self._call("POST", "/se/log", {"type": "browser"})
-        return [f"{one['level']}: {one['message']}" for one in told]
-
-    def _call(self, method: str, path: str, data: Any = None) -> Any:
+    def call(self, method: str, path: str, data: Any = None) -> Any:
+        """Return the value with which the driver answers a request of the WebDriver protocol."""
         body = None if method == "GET" else json.dumps(data or {}).encode()
         request = urllib.request.Request(
             self._base + path, body, {"Content-Type": "application/json"}, method=method

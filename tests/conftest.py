@@ -1,4 +1,4 @@
-"""Test settings (float64, no display) and the fixtures shared by the geometry tests."""
+"""Test settings: float64, checked shapes, one folder of compiled programs, no display."""
 
 import gc
 import os
@@ -6,9 +6,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
-import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
@@ -59,12 +56,12 @@ settings.register_profile("fuzz", deadline=None, max_examples=5_000, print_blob=
 settings.load_profile("rootsopt")
 
 
+# The first two share few programs: neither process repeats what the other compiles.
 _LONGEST_FIRST = (
     *("identify", "response", "continuation", "steady", "tradeoffs", "robust", "improve"),
     *("rattle", "leakage", "reserve", "basins", "assumptions", "export", "optimize"),
     *("ensemble", "pages", "gradients", "known", "start", "outline", "families"),
 )
-"""The first two share few programs: neither process repeats what the other compiles."""
 
 
 def pytest_collection_modifyitems(items):
@@ -79,45 +76,3 @@ def pytest_sessionfinish(session):
     gc.freeze()  # pytest looks for garbage several times at the end: in all objects of JAX.
     if not hasattr(session.config, "workerinput"):
         shutil.rmtree(os.environ["ROOTSOPT_TEST_CACHE"], ignore_errors=True)
-
-
-def _graded_normals(profile, points):
-    """Return normal angles that include every segment end, evenly spaced in arc length + angle.
-
-    Equal arc lengths alone would leave wide angles between nodes where the radius of curvature
-    vanishes (pitch point of EE). Polygon and cubic are both inaccurate there."""
-    pieces = []
-    for segment in profile.segments():
-        if not float(segment.stop) > float(segment.start):
-            continue
-        nu = np.linspace(float(segment.start), float(segment.stop), 2001)
-        middle = jnp.asarray((nu[1:] + nu[:-1]) / 2)
-        _, addendum, dedendum = profile.speeds(middle)
-        speed = np.maximum(np.abs(addendum), np.abs(dedendum))
-        speed = speed + 0.3 * float(profile.pitch_radius)
-        pieces.append((nu, np.concatenate([[0.0], np.cumsum(speed * np.diff(nu))])))
-    total = sum(measure[-1] for _, measure in pieces)
-    normals = []
-    for nu, measure in pieces:
-        count = max(8, int(points * measure[-1] / total)) + 1
-        normals.append(np.interp(np.linspace(0, measure[-1], count), measure, nu)[:-1])
-    return np.append(np.concatenate(normals), pieces[-1][0][-1])
-
-
-@pytest.fixture(scope="session")
-def graded_outline():
-    """Return a function (profile, points) → closed outline (m) with dense nodes at high
-    curvature."""
-
-    def build(profile, points):
-        nu = jnp.asarray(_graded_normals(profile, points))
-        addendum = np.asarray(profile.position(profile.addendum(nu)))
-        dedendum = np.asarray(profile.position(profile.dedendum(nu)))
-        flank = np.concatenate([addendum, dedendum[-2::-1]]) @ [1, 1j]
-        lobe_turn = np.exp(2j * np.pi / profile.lobes)
-        lobe = np.concatenate([flank[:-1], (np.conj(flank) * lobe_turn)[:0:-1]])
-        turns = lobe_turn ** np.arange(profile.lobes)
-        closed = np.concatenate([*(lobe * turn for turn in turns), lobe[:1]])
-        return np.stack([closed.real, closed.imag], axis=-1)
-
-    return build

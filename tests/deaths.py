@@ -76,23 +76,17 @@ def digest(folder: Path) -> frozenset | None:
     )
 
 
-def prepared(parent: Path, before: str) -> Path:
-    """Return a target with the state `before` in an empty folder `parent`."""
-    target = parent / "run"
-    if before == "empty":
-        target.mkdir()
-    elif before != "absent":
-        write_run(target, "old")
-    return target
-
-
 def failures(place: Path, kind: str, before: str, at: int) -> tuple[bool, list[str]]:
     """Let operation number `at` of a run fail (`full`), or the process end before it (`dead`).
 
     Return whether there was such an operation, and what is wrong afterwards."""
     new, after = digest_of("new"), digest_of("next")
-    (place / "parent").mkdir()
-    target = prepared(place / "parent", before)
+    target = place / "parent" / "run"
+    target.parent.mkdir()
+    if before == "empty":
+        target.mkdir()
+    elif before != "absent":
+        write_run(target, "old")
     old, listing = digest(target), sorted(os.listdir(target.parent))
     hit, reported = _tried(target, kind, before, at)
     now, names = digest(target), sorted(os.listdir(target.parent))
@@ -142,7 +136,6 @@ def _tried(target: Path, kind: str, before: str, at: int) -> tuple[bool, str | N
 
 @functools.cache
 def digest_of(text: str) -> frozenset | None:
-    """Return the digest of a complete run."""
     with tempfile.TemporaryDirectory() as place:
         write_run(Path(place) / "run", text)
         return digest(Path(place) / "run")

@@ -94,22 +94,12 @@ class Planar:
     against the rotors."""
 
     def __init__(self, config, inertia, mass, load):
-        scene, law = config.scene, config.contact
+        self.scene, self.law = config.scene, config.contact
         self.flank = Flank(config.profile)
-        self.radius, self.lobes = self.flank.radius, config.profile.lobes
-        self.inertia, self.mass = inertia, mass
-        self.distance = 2 * self.radius + 1e-3 * scene.center_distance_error_mm
-        self.law = law
-        self.rounding = law.smoothing_mm * 1e-3
-        self.clearance = law.clearance_mm * 1e-3
-        self.speed = scene.speed_rpm * 2 * np.pi / 60
-        self.load = load
-        self.motor, self.supports = scene.motor, scene.supports
-        self.gear = scene.timing_gear
-        self.play = 1e-3 * self.gear.backlash_mm / (2 * self.radius)
-        stiffness = self.gear.stiffness_N_m_per_rad
-        self.gear_damping = 2 * self.gear.damping_ratio * np.sqrt(stiffness * inertia / 2)
-        self.middle = 1e-3 * scene.phase_error_mrad
+        self.radius, self.lobes = self.flank.radius, self.flank.lobes
+        self.inertia, self.mass, self.load = inertia, mass, load
+        self.distance = 2 * self.radius + 1e-3 * self.scene.center_distance_error_mm
+        self.rounding, self.clearance = 1e-3 * self.law.smoothing_mm, 1e-3 * self.law.clearance_mm
 
     def ramp(self, x, width):
         """Return max(0, x), rounded over `width`."""
@@ -119,9 +109,9 @@ class Planar:
 
     def normal_force(self, depth, closing):
         delta = self.ramp(depth, self.rounding)
-        full = self.law.full_damping_depth_mm * 1e-3
         if delta == 0:
             return 0.0
+        full = self.law.full_damping_depth_mm * 1e-3
         x = min(delta / full, 1.0)
         spring = self.law.stiffness_N_per_mm_e * (1e3 * delta) ** self.law.exponent
         damping = 1e3 * self.law.max_damping_N_s_per_mm * (3 * x**2 - 2 * x**3)
@@ -206,14 +196,11 @@ class Planar:
 
     def forces(self, state):
         """Return torques on the rotors, forces on their axes and contact force."""
-        (phi1, phi2), shifts = state[:2], state[2:6]
-        (speed1, speed2), drifts = state[6:8], state[8:12]
-        axes = np.array([0, self.distance]) + shifts[::2] + 1j * shifts[1::2]
-        moving = drifts[::2] + 1j * drifts[1::2]
-        torques, pushes = np.zeros(2), np.zeros(2, complex)
-        total = 0.0
+        axes = np.array([0, self.distance]) + state[2:6:2] + 1j * state[3:6:2]
+        (speed1, speed2), moving = state[6:8], state[8:12:2] + 1j * state[9:12:2]
+        torques, pushes, total = np.zeros(2), np.zeros(2, complex), 0.0
         # Of the drive flanks and of the coast flanks, where they exist.
-        for touch in filter(None, [self.touch(side, (phi1, phi2), axes) for side in (1, -1)]):
+        for touch in filter(None, [self.touch(side, state[:2], axes) for side in (1, -1)]):
             arm1, arm2 = touch.first - axes[0], touch.second - axes[1]
             slip = moving[0] + 1j * speed1 * arm1 - moving[1] + 1j * speed2 * arm2
             depth = -touch.gap - self.clearance
@@ -229,23 +216,22 @@ class Planar:
         """Return d(state)/dt."""
         torques, pushes, _ = self.forces(state)
         torques = torques - np.array(self.load(state[0]))
-        aside = state[1] - state[0] - self.middle
-        excess = abs(aside) - self.play
+        gear, motor, supports = self.scene.timing_gear, self.scene.motor, self.scene.supports
+        aside = state[1] - state[0] - 1e-3 * self.scene.phase_error_mrad
+        excess = abs(aside) - 1e-3 * gear.backlash_mm / (2 * self.radius)
         width = self.rounding / self.radius
         t = np.clip(excess / width, 0, 1)
         # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
         bump = t**2 * (1 - t) ** 2
         taken_up = self.ramp(excess, width) + 2.5 * width * bump
-        hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
-        engaged = t**2 * (3 - 2 * t) + 15 * bump
-        hold += self.gear_damping * engaged * (state[7] - state[6])
-        torques += hold, -hold
-        accelerations = torques / self.inertia
-        motor = self.motor.torque_N_m
-        motor -= self.motor.slope_N_m_s_per_rad * (state[6] - self.speed)
-        accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
+        hold = gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
+        damping = 2 * gear.damping_ratio * np.sqrt(gear.stiffness_N_m_per_rad * self.inertia / 2)
+        hold += damping * (t**2 * (3 - 2 * t) + 15 * bump) * (state[7] - state[6])
+        slip = state[6] - self.scene.speed_rpm * 2 * np.pi / 60
+        drive = motor.torque_N_m - motor.slope_N_m_s_per_rad * slip
+        first = (torques[0] + hold + drive) / (self.inertia + motor.inertia_kg_m2)
         along = np.stack([pushes.real, pushes.imag], axis=1).ravel()
-        along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
-        along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
-        along /= self.mass
-        return np.concatenate([state[6:], accelerations, along])
+        along -= 1e3 * supports.stiffness_N_per_mm * state[2:6]
+        along -= 1e3 * supports.damping_N_s_per_mm * state[8:12]
+        second = (torques[1] - hold) / self.inertia
+        return np.concatenate([state[6:], [first, second], along / self.mass])

@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_905,
-    "statements of the tests": 14_180,
+    "statements of the package": 25_895,
+    "statements of the tests": 13_282,
     "statements of the experiments": 4_478,
     "packages": 13,
     "files of the package": 197,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 31_452,
+    "words of docs": 31_451,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

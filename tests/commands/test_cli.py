@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pandas as pd
 import pytest
 import yaml
@@ -28,13 +27,6 @@ from tests.runtime.test_environment import HARMLESS, SET_ASIDE
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 EE = str(ROOT / "configs" / "ee.yaml")
-SMALL = [
-    "--set", "optimizer.screening=2",
-    "--set", "optimizer.starts=1",
-    "--set", "optimizer.iterations=2",
-    "--set", "optimizer.prove=false",
-    "--set", "assumptions.scenes=0",
-]  # fmt: skip
 
 
 @pytest.fixture
@@ -55,7 +47,11 @@ def test_optimize_writes_the_contract(tmp_path, command):
     """`optimize` writes every promised file, a table and the times of compiling and running.
 
     The exit code is 0 and stderr is empty."""
-    done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
+    done = command(
+        "optimize", CIC, "-o", tmp_path, "--export", "dxf", "--set=optimizer.screening=2",
+        "--set=optimizer.starts=1", "--set=optimizer.iterations=2", "--set=optimizer.prove=false",
+        "--set=assumptions.scenes=0",
+    )  # fmt: skip
     assert (done.returncode, done.err) == (0, "")
     words = "baseline", "optimised", "pressure angle", "mean force", "periodic", "compile"
     assert [word for word in (*words, "Pump sheet") if word not in done.out] == []
@@ -65,13 +61,8 @@ def test_optimize_writes_the_contract(tmp_path, command):
         record = result[name]
         assert record["status"] == record["steady_state"]["kind"] == "periodic"
         assert set(record["design"]) == set(record["gradient"]["mean_force_N"])
-        assert record["steady_state"]["floquet_multiplier"] < 1
-        outline = pd.read_csv(tmp_path / f"profile_{name}.csv")
-        assert [*outline] == ["x_mm", "y_mm"]
-        np.testing.assert_array_equal(outline.iloc[0], outline.iloc[-1])
-        response = pd.read_csv(tmp_path / f"response_{name}.csv")
-        assert (response.columns[0], response.columns[-1]) == ("time_s", "contact_force_N")
-        force = response.contact_force_N.mean()
+        assert [*pd.read_csv(tmp_path / f"profile_{name}.csv")] == ["x_mm", "y_mm"]
+        force = pd.read_csv(tmp_path / f"response_{name}.csv").contact_force_N.mean()
         assert force == pytest.approx(record["response"]["mean_force_N"], rel=1e-3)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["screening"] == 2
     # Two iterations are too few for the first-order conditions.
@@ -80,15 +71,14 @@ def test_optimize_writes_the_contract(tmp_path, command):
     assert len(result["optimality"]["starts"]) == 1
     assert all("multiplier" in row for row in result["constraints"])
     names = "profiles", "meshing", "force", "spectrum", "history", "comparison"
-    figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert figures == {f"{name}.png" for name in names}
+    assert {*os.listdir(tmp_path / "figures")} == {f"{name}.png" for name in names}
     assert (tmp_path / "history.csv").read_text().count("\n") >= 4
     # The optimised design, as a config and as a drawing, both read back.
     best, config = result["optimized"]["geometry"], load(tmp_path / "optimized.yaml")
     drawn = profiles.geometry(Scene.from_config(config).profile(design_vector(config)))
     assert float(drawn.area) * 1e6 == pytest.approx(best["area_mm2"], rel=1e-9)
-    loop = read(tmp_path / "rotor.dxf").points
-    assert abs(signed_area(loop)) == pytest.approx(best["area_mm2"], rel=1e-3)
+    area = abs(signed_area(read(tmp_path / "rotor.dxf").points))
+    assert area == pytest.approx(best["area_mm2"], rel=1e-3)
 
 
 def test_profile_writes_one_record(tmp_path, command):
@@ -120,34 +110,53 @@ def test_no_usable_result_exits_3(tmp_path, command):
         assert (record["status"], record["response"]) == ("passed_through", {})
 
 
+SPEEDS = "--over=scene.speed_rpm=1000:2000:2"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["missing.yaml"], ["missing.yaml", "no such file"]),
-        ([CIC, "--set", "profile.presure_angle_deg=30"], ["profile.pressure_angle_deg"]),
-        ([CIC, "--set", "profile.lobes=9"], ["profile.lobes", "6", "9"]),
-        ([CIC, "--set", "scene.speed_rpm=fast"], ["scene.speed_rpm", "number", "fast"]),
-        ([CIC, "--set", "profile.involute_length_mm=20"], ["involute_length_mm", "20"]),
-        ([CIC, "--set", "scene.speed_rpm"], ["dotted.key=value"]),
+        (["simulate", "missing.yaml"], ["missing.yaml", "no such file"]),
+        (["simulate", CIC, "--set=profile.presure_angle_deg=30"], ["profile.pressure_angle_deg"]),
+        (["simulate", CIC, "--set=profile.lobes=9"], ["profile.lobes", "6", "9"]),
+        (["simulate", CIC, "--set=scene.speed_rpm=fast"], ["scene.speed_rpm", "number", "fast"]),
+        (["simulate", CIC, "--set=profile.involute_length_mm=20"], ["involute_length_mm", "20"]),
+        (["simulate", CIC, "--set", "scene.speed_rpm"], ["dotted.key=value"]),
+        (["sweep", "cic", "--sobol=4", "--zip"], ["does not go with samples"]),
+        (["sweep", "cic", "--over=scene.sped_rpm=1,2"], ["did you mean `scene.speed_rpm`"]),
+        (["sweep", "cic", SPEEDS, "--over=scene.speed_rpm=3"], ["given twice"]),
+        (["sweep", "cic", SPEEDS, "--seed=1"], ["--sample N"]),
+        (["sweep", "cic", SPEEDS, "--zip", "--zip-keys=a,b"], ["remove one"]),
+        (["sweep", "cic", SPEEDS, "--resume"], ["there is no"]),
+        (["sweep", "cic", SPEEDS, "--tolerances=4"], ["remove one"]),
+        (["sweep", "cic", "--tolerances=4"], ["section `tolerances`"]),
+        (["sweep", "cic", SPEEDS, "--workers=0"], ["from 1"]),
     ],
 )
 def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path, command):
-    done = command("simulate", *arguments, "-o", tmp_path / "out")
+    done = command(*arguments, "-o", tmp_path / "out")
     assert (done.returncode, done.out) == (2, "")
     assert done.err.strip().count("\n") == 0
     assert [word for word in words if word not in done.err] == []
-    assert not (tmp_path / "out").exists()
+    assert os.listdir(tmp_path) == []
 
 
-def test_console_command(capsys):
-    """An unknown command gets the nearest name as a suggestion.
+def test_console_command(monkeypatch, capsys):
+    """A file after `-h` is not a group of keys.
 
-    A file after `-h` is not a group of keys."""
-    assert console.main(["optimise"]) == 2
-    assert "optimize" in capsys.readouterr().err
+    An unknown command gets the nearest name as a suggestion, completion the shells that it takes,
+    or the missing library."""
     with pytest.raises(SystemExit, match=r"^0$"):
         console.main(["simulate", "-h", CIC])
     assert "backlash_mm" in capsys.readouterr().out
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    for arguments, words in (
+        (["optimise"], "`optimize`"),
+        (["--completion", "tcsh"], "bash or zsh"),
+        (["--completion", "bash"], "rootsopt[completion]"),
+    ):
+        assert console.main(arguments) == 2
+        assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["optimize", "sweep", "new"])
@@ -159,8 +168,7 @@ def test_groups_of_the_help_have_every_key(command, capsys, monkeypatch):
             COMMANDS[command].main(["--help", *group])
         return capsys.readouterr().out
 
-    short = printed()
-    assert set(re.findall("--help ([a-z |]+)$", short, re.M)[-1].split(" | ")) == set(GROUPS)
+    assert {*re.findall("--help ([a-z |]+)$", printed(), re.M)[-1].split(" | ")} == set(GROUPS)
     every = [line for group in GROUPS for line in printed(group).splitlines()]
     assert sorted(every) == sorted(describe(Config).splitlines())
     assert set(every) < set(printed("all").splitlines())
@@ -178,9 +186,9 @@ def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_pat
             unfinished = shutil.ignore_patterns(".*")
             cache = Path(shutil.copytree(cache, tmp_path / "cache", ignore=unfinished))
             kept = {path.name: path.stat().st_ino for path in cache.iterdir()}
-        arguments = "simulate", EE, "--no-figures", "-o", tmp_path / run
         done = subprocess.run(
-            [sys.executable, "-m", "rootsopt", *map(str, arguments)],
+            [sys.executable, "-m", "rootsopt", "simulate", EE, "--no-figures",
+             "-o", str(tmp_path / run)],
             capture_output=True, text=True, cwd=ROOT, check=False,
             env=os.environ | {"COLUMNS": "100"} | variables | {"ROOTSOPT_CACHE": str(cache)},
         )  # fmt: skip
@@ -210,13 +218,6 @@ def bash():
     return cli.completion("bash")
 
 
-def completed(script, words):
-    given = " ".join(f"'{word}'" for word in words)
-    code = f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _rootsopt 2>/dev/null; "
-    code += 'printf "%s\\n" "${COMPREPLY[@]}"'
-    return subprocess.check_output(["bash", "--norc", "-c", f"{script}\n{code}"], text=True).split()
-
-
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 @pytest.mark.parametrize(
     ("words", "first"),
@@ -228,7 +229,9 @@ def completed(script, words):
     ],
 )
 def test_commands_options_and_keys_are_completed(bash, words, first):
-    assert completed(bash, ["rootsopt", *words]) == first
+    script = f"{bash}\nCOMP_WORDS=(rootsopt {' '.join(words)}); COMP_CWORD={len(words)}; "
+    script += '_rootsopt 2>/dev/null; printf "%s\\n" "${COMPREPLY[@]}"'
+    assert subprocess.check_output(["bash", "--norc", "-c", script], text=True).split() == first
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -236,8 +239,8 @@ def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
     """The script has a command's own options, not only those that all commands share."""
     with pytest.raises(SystemExit, match=r"^0$"):
         console.main([command, "--help"])
-    told = re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", capsys.readouterr().out, re.M)
-    wanted = set(told) - {"--help"}
+    help_text = capsys.readouterr().out
+    wanted = {*re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", help_text, re.M)} - {"--help"}
     own = {"explore": {"--set", "--port"}, "new": {"--lobes"}}.get(command, {"--set", "--report"})
     assert own <= wanted
     (line,) = re.findall(rf"^_shtab_rootsopt_{command}_option_strings=\((.*?)\)$", bash, re.M)
@@ -248,11 +251,3 @@ def test_zsh_has_a_script():
     text = cli.completion("zsh")
     assert text.startswith("#compdef rootsopt")
     assert "scene.timing_gear.backlash_mm=" in text
-
-
-def test_unknown_shell_and_missing_library(monkeypatch, capsys):
-    assert console.main(["--completion", "tcsh"]) == 2
-    assert "bash or zsh" in capsys.readouterr().err
-    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
-    assert console.main(["--completion", "bash"]) == 2
-    assert "rootsopt[completion]" in capsys.readouterr().err

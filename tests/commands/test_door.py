@@ -18,9 +18,13 @@ CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 def python(code, *arguments, **options):
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
-    # If the tests run in the background, Ctrl-C is ignored in their child processes too.
-    options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        cwd=ROOT,
+        # If the tests run in the background, Ctrl-C is ignored in their child processes too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        **options,
+    )
 
 
 MODULE = "import runpy, sys; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
@@ -47,9 +51,9 @@ BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNB
 
 def shell(redirection, code, size=10):
     """Return exit code and stderr of a process that prints, with a shell's redirection."""
-    command = f'"$0" -c "$1" {code} {size} {redirection}'
+    command = f'"$0" -c "$1" {code} {size} {redirection}; exit ${{PIPESTATUS[0]}}'
     done = subprocess.run(
-        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}", sys.executable, WORK],
+        ["bash", "-c", command, sys.executable, WORK],
         cwd=ROOT, capture_output=True, text=True, check=False, env=BUFFERED,
     )  # fmt: skip
     return done.returncode, done.stderr
@@ -74,7 +78,7 @@ def test_output_that_cannot_be_written_is_told(code):
 
 @pytest.mark.parametrize(
     ("arguments", "code"),
-    [(["--help"], 0), (["--version"], 0), (["profile", "--help"], 0), ([], 2)],
+    [(["--version"], 0), (["profile", "--help"], 0), ([], 2)],
 )
 def test_help_into_a_closed_pipe(arguments, code):
     reading, writing = os.pipe()
@@ -84,30 +88,31 @@ def test_help_into_a_closed_pipe(arguments, code):
     assert found == (code, None, "")
 
 
-THREAD = (
-    "go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
-    "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
-)
-IGNORED = (
-    "signal.signal(signal.SIGINT, signal.SIG_IGN);"
-    "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
-    "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
-)
-LETTERS = "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
-ASCII = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
-
-
 @pytest.mark.parametrize(
     ("code", "variables", "found"),
     [
         # The process ends without waiting for a compilation that is no longer needed.
-        (THREAD.format(daemon=True), {}, (3, "said\n", "")),
-        (THREAD.format(daemon=False), {}, (3, "said\n", "")),
+        (
+            "go = lambda: threading.Thread(target=time.sleep, args=(60,)).start();"
+            "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))",
+            {},
+            (3, "said\n", ""),
+        ),
         # As for a background job of a script.
-        (IGNORED, {}, (0, "", "")),
-        (LETTERS, ASCII, (0, "?m ?\n", "")),
+        (
+            "signal.signal(signal.SIGINT, signal.SIG_IGN);"
+            "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(0.5));"
+            "sys.exit(door.through('test', lambda: kill() and 0, own=True))",
+            {},
+            (0, "", ""),
+        ),
+        (
+            "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))",
+            {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
+            (0, "?m ?\n", ""),
+        ),
     ],
-    ids=["daemon", "thread", "signals that are ignored", "letters that the terminal lacks"],
+    ids=["thread", "signals that are ignored", "letters that the terminal lacks"],
 )
 def test_the_end_of_a_process(code, variables, found):
     began = time.monotonic()
@@ -132,7 +137,6 @@ def work():
 door.leave(door.through("test", work, own=True))
 """
 )
-AT_ONCE = "print('here', flush=True); time.sleep(60)"
 # Unlike a sleep of the C library, this does not end at a signal.
 COMPILED = """print('here', flush=True)
         import hashlib; hashlib.pbkdf2_hmac("sha256", b"a", b"b", 10**9)"""
@@ -143,19 +147,20 @@ PATIENT = """
 
 
 FINISHING = signal.SIGTERM, "SIGTERM: finishing (once more to stop at once)"
-BY_CTRL_C = signal.SIGINT, "stopped by Ctrl-C; {run} is unchanged"
-BY_SIGTERM = signal.SIGTERM, "stopped by SIGTERM; {run} is unchanged"
 
 
 @pytest.mark.parametrize(
     ("wait", "signals", "left"),
     [
-        (AT_ONCE, [BY_CTRL_C], set()),
-        (COMPILED, [BY_SIGTERM], set()),
+        (COMPILED, [(signal.SIGTERM, "stopped by SIGTERM; {run} is unchanged")], set()),
         (PATIENT.format(twice=""), [FINISHING], {"run", "config.yaml", "result.json"}),
-        (PATIENT.format(twice="yes"), [FINISHING, BY_CTRL_C], set()),
+        (
+            PATIENT.format(twice="yes"),
+            [FINISHING, (signal.SIGINT, "stopped by Ctrl-C; {run} is unchanged")],
+            set(),
+        ),
     ],
-    ids=["at once", "in compiled code", "a patient run", "a patient run at the second signal"],
+    ids=["in compiled code", "a patient run", "a patient run at the second signal"],
 )
 def test_a_signal_stops_a_run(tmp_path, wait, signals, left):
     """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind. A
@@ -165,23 +170,26 @@ def test_a_signal_stops_a_run(tmp_path, wait, signals, left):
     assert len(os.listdir(tmp_path)) == 2
     for number, said in signals:
         process.send_signal(number)
-        line = f"rootsopt test: {said.format(run=tmp_path / 'run')}\n"
-        assert process.stderr.readline() == line
+        assert process.stderr.readline() == f"rootsopt test: {said.format(run=tmp_path / 'run')}\n"
     assert (process.wait(20), process.stderr.read()) == (3, "")
     assert {path.name for path in tmp_path.rglob("*")} == left
 
 
 @pytest.mark.parametrize(
     ("command", "module"),
-    [("rootsopt", "argparse"), ("rootsopt.simulate", "jax"), ("rootsopt.optimize", "pydantic")],
+    [
+        ("rootsopt simulate", "argparse"),
+        ("rootsopt.simulate", "jax"),
+        ("rootsopt.optimize", "pydantic"),
+    ],
 )
 def test_an_interrupt_during_imports(tmp_path, command, module):
     """An interrupt is handled while a module is imported; a stand-in of that name never returns."""
-    text = "print('here', flush=True)\nimport time\ntime.sleep(60)\n"
-    (tmp_path / f"{module}.py").write_text(text)
-    arguments = ["simulate", CIC] if command == "rootsopt" else [CIC]
+    endless = "print('here', flush=True)\nimport time\ntime.sleep(60)\n"
+    (tmp_path / f"{module}.py").write_text(endless)
+    arguments = [*command.split(), CIC, "-o", str(tmp_path / "run")]
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    process = python(MODULE, command, *arguments, "-o", str(tmp_path / "run"), env=environment)
+    process = python(MODULE, *arguments, env=environment)
     assert process.stdout.readline() == "here\n"
     process.send_signal(signal.SIGINT)
     _, told = process.communicate()
@@ -190,19 +198,15 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
 
 
 def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch):
-    """Signals, streams and file descriptors are unchanged."""
-    monkeypatch.chdir(ROOT)
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    streams, threads = (sys.stdout, sys.stderr), threading.active_count()
+    def state():
+        return *map(signal.getsignal, (signal.SIGINT, signal.SIGTERM)), sys.stdout, sys.stderr
+
+    before, threads = state(), threading.active_count()
     assert main(["profile", "missing.yaml"]) == 2
-    assert main(["nonsense"]) == 2
-    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    assert (sys.stdout, sys.stderr) == streams
-    assert threading.active_count() == threads
+    assert (state(), threading.active_count()) == (before, threads)
     monkeypatch.setattr(sys, "argv", ["rootsopt", "--version"])
     assert main() == 0
-    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    assert (sys.stdout, sys.stderr) == streams
+    assert state() == before
 
 
 WORKS = ", ".join(
@@ -256,5 +260,4 @@ def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
     full = OSError(28, "No space left on device", "/tmp/elsewhere")
     monkeypatch.setattr("rootsopt.commands.cli.load", mock.Mock(side_effect=full))
     assert main(["profile", CIC]) == 2
-    expected = "rootsopt profile: /tmp/elsewhere: no space left on device\n"
-    assert capsys.readouterr().err == expected
+    assert capsys.readouterr().err == "rootsopt profile: /tmp/elsewhere: no space left on device\n"

@@ -7,7 +7,6 @@ import shlex
 
 import numpy as np
 import pytest
-import yaml
 
 from experiments._common.polygons import pair_gap
 from rootsopt.commands.console import main
@@ -50,14 +49,15 @@ def test_rotors_have_the_diameter_and_mesh_at_the_centre_distance(
 ):
     """Seen on polygons: the outer radius to 1e-6 mm, and no overlap beyond that of the polygons."""
     path = tmp_path / "pump.yaml"
-    size = {"centre_distance_mm": across, "outer_diameter_mm": outer, "length_mm": across}
-    load_ = {"power_kW": None, "pressure_difference_bar": 0.3, "speed_rpm": 3e5 / across}
-    assert made(path, lobes=lobes, family=family, **size, **load_) == 0
+    sheet = {
+        "centre_distance_mm": across, "outer_diameter_mm": outer, "length_mm": across,
+        "power_kW": None, "pressure_difference_bar": 0.3, "speed_rpm": 3e5 / across,
+    }  # fmt: skip
+    assert made(path, lobes=lobes, family=family, **sheet) == 0
     config = load(path)
     line = outline_mm(config)
     assert config.profile.family == (family or "cic")
     assert np.max(np.hypot(*line.T)) == pytest.approx(outer / 2, abs=1e-6)
-    assert len(np.unique(np.round(np.hypot(*line.T) / outer, 9))) > 100
     gaps = [pair_gap(line, lobes, across, x, x) for x in np.linspace(0.0, math.pi / lobes, 7)]
     assert np.max(np.abs(gaps)) < 2e-5 * across
     assert notes(config) == ()
@@ -68,15 +68,13 @@ def test_load_and_comments_are_those_of_the_sheet(tmp_path, capsys):
     path = tmp_path / "pump.yaml"
     assert made(path) == 0
     power = load(path)
-    told = capsys.readouterr().out
     assert power.scene.load.torque_N_m * 2 * 2 * math.pi * 50 == pytest.approx(1e4, rel=1e-3)
     x, y = outline_mm(power).T
     area = np.sum(x[:-1] * np.diff(y) - y[:-1] * np.diff(x)) / 2
     volume = 2 * (math.pi * 100**2 - area) * 300 * 1e-9
     assert power.pump.pressure_difference_Pa == pytest.approx(1e4 / (volume * 50), rel=1e-3)
-    assert f"{volume * 1e3:.3f}"[:4] in told
+    assert f"{volume * 1e3:.3f}"[:4] in capsys.readouterr().out
     text = path.read_text()
-    assert yaml.safe_load(text)["profile"]["pitch_radius_mm"] == 62.5
     lines = [line for line in text.splitlines() if not line.startswith("#") and line]
     assert all(" # " in line for line in lines if not line.endswith(":"))
     assert parse(text) == power == parse(power.to_yaml())
@@ -87,13 +85,13 @@ def test_load_and_comments_are_those_of_the_sheet(tmp_path, capsys):
     assert made(path, "--overwrite", **more, clearance_mm=0.05) == 0
     gas = load(path)
     ideal = 0.3e5 * volume * 50 / 1e3
-    told = capsys.readouterr().out
-    assert f"takes {ideal:.3g} kW without losses, {ideal / 10:.0%} of the 10 kW" in told
+    words = f"takes {ideal:.3g} kW without losses, {ideal / 10:.0%} of the 10 kW"
+    assert words in capsys.readouterr().out
     assert gas.scene.load.pressure_difference_Pa == 3e4
     assert (gas.pump.gas, gas.pump.viscosity_mPa_s) == (None, 1.0)
-    assert (gas.rotor.density_kg_m3, gas.scene.timing_gear.backlash_mm) == (7900, 0.05)
+    assert gas.rotor.density_kg_m3 == 7900
     assert gas.objective.terms == {"leakage_fraction": 1}
-    assert gas.contact.clearance_mm == 0.05
+    assert gas.contact.clearance_mm == gas.scene.timing_gear.backlash_mm == 0.05
     # The command in the first comment makes the same sheet.
     assert re.search("rootsopt new .*--medium water --material stainless-steel", head_of(path))
 
@@ -176,7 +174,6 @@ def test_any_key_can_be_set(tmp_path, capsys):
         ({"family": "cci"}, "did you mean cic?"),
         ({"family": "ee"}, "`--outer-diameter-mm` must be 187.5 in family ee at 2 lobes"),
         ({"family": "outline"}, "`--family` must be one of 'cic', 'ee'"),
-        ({"family": "hypo_epicycloid", "outer_diameter_mm": 201}, "must be from 1"),
         # 125 (1 + sin 30°), the limit of three lobes.
         ({"lobes": 3}, "`--outer-diameter-mm` must be below 187.5 at 3 lobes and 125 mm"),
     ],
@@ -192,8 +189,9 @@ def test_the_stated_range_can_be_met(tmp_path, capsys):
     """Both ends of the range in a refusal are diameters that the family has; beyond, none is."""
     family = {"family": "hypo_epicycloid"}
     assert made(tmp_path / "pump.yaml", outer_diameter_mm=201, **family) == 2
-    ends = re.search(r"must be from (.*) to (.*) \(by", capsys.readouterr().err).groups()
-    low, high = map(float, ends)
+    assert not [*tmp_path.iterdir()]
+    words = r"`--outer-diameter-mm` must be from (.*) to (.*) \(by"
+    low, high = map(float, re.search(words, capsys.readouterr().err).groups())
     # EE, without a land, is the widest of this family; the land is at least 0.5 °, with room.
     assert 0.98 * 187.5 < high < 187.5
     for diameter in (low + 0.2, high - 0.2):
@@ -212,13 +210,13 @@ def test_a_terminal_is_asked_for_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", Terminal("\n".join(answers) + "\n"))
     assert main(["new", str(path), "--centre-distance-mm", "125", "--family", "cic"]) == 0
     told = capsys.readouterr().err
-    for words in (
+    asked = (
         "length of a rotor in mm: lobes of a rotor: ",
         "gap of flanks in mm [outer diameter / 1000]: ",
         "`--lobes` must be a whole number, but is 'two'",
         "what is pumped (air | nitrogen",
-    ):
-        assert words in told
+    )
+    assert [words for words in asked if words not in told] == []
     config = load(path)
     assert config.scene.load.pressure_difference_Pa == 3e4
     assert config.pump.gas.heat_ratio == 1.667

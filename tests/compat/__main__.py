@@ -67,15 +67,10 @@ def prepared() -> tuple[Path, Path]:
         shutil.rmtree(FOLDER / name, ignore_errors=True)
     build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*build, "--wheel-dir", str(FOLDER / "wheel"), str(ROOT)], check=True)
-    ignored = shutil.ignore_patterns("__pycache__")
     for name in COPIED:
-        source, target = ROOT / name, FOLDER / "tree" / name
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=ignored)
-        else:
-            shutil.copy(source, target)
-    (package,) = (FOLDER / "wheel").glob("*.whl")
-    return package, FOLDER / "tree"
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, FOLDER / "tree" / name)
+    return next((FOLDER / "wheel").glob("*.whl")), FOLDER / "tree"
 
 
 def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) -> str:
@@ -86,7 +81,6 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
     constraints = Path(f"{place}.txt")
     constraints.write_text("" if newest else "\n".join(bounds()))
     imports, extras = (f"{IMPORTS}, build123d", f"{EXTRAS},{CAD}") if newest else (IMPORTS, EXTRAS)
-    search = ["--set", "optimizer.starts=1", "--set", "optimizer.screening=0"]
     steps = {
         "environment": [interpreter, "-m", "venv", str(place)],
         "install": [
@@ -100,7 +94,10 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
             *TOOLS,
         ],
         "import": [python, "-c", f"import rootsopt, {imports}"],
-        "main job": [script, "optimize", "cic", "-o", str(place / "run"), *search],
+        "main job": [
+            *(script, "optimize", "cic", "-o", str(place / "run")),
+            *("--set", "optimizer.starts=1", "--set", "optimizer.screening=0"),
+        ],
         "tests": [python, "-m", "pytest", *TESTS, *(f"--deselect={one}" for one in LEFT)],
     }
     environment = os.environ | {"ROOTSOPT_CACHE": str(place / "cache")}
@@ -118,7 +115,6 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
 
 
 def main() -> int:
-    """Run the jobs, and print a line for each."""
     parser = argparse.ArgumentParser(prog="python -m tests.compat", description=__doc__)
     usual = ["python3.11", "python3.12", "python3.13"]
     parser.add_argument("--pythons", nargs="+", default=usual, help="interpreters: names or paths")

@@ -17,7 +17,8 @@ from tests.standins import ROOT, refusal
 
 FULL = [
     "contact.clearance_mm=0.05",
-    "contact.friction={}",
+    # Static friction may be kinetic friction.
+    "contact.friction={static: 0.1, kinetic: 0.1}",
     "contact.wear={offset_mm: 0.02, depth_mm: 0.03}",
     "rotor.helix_deg=60",
     "rotor.bore_mm=12",
@@ -142,10 +143,6 @@ def test_limits_and_friction_that_cannot_be_are_refused(override, words):
     assert re.search(words, refusal(load, "cic_drawn", [override]))
 
 
-def test_static_friction_may_be_kinetic_friction():
-    assert load("pump", ["contact.friction={static: 0.1, kinetic: 0.1}"]).contact.friction
-
-
 CLEARANCE, SPEED = "contact.clearance_mm", "scene.speed_rpm"
 OVER = "assumptions.over"
 
@@ -154,42 +151,47 @@ def ranges(*overrides, name="cic_drawn"):
     return {one.key: one.ends for one in load(name, overrides).spans}
 
 
-def test_ranges_of_parameters_that_a_config_leaves_open():
+@pytest.mark.parametrize(
+    ("key", "ends"),
+    [
+        ("arc_center_mm", (15.0, 29.97)),
+        ("rolling_radius_mm", (0.3, 45.0)),
+        ("edge_radius_mm", (0.3, 45.0)),
+        ("tip_arc_angle_deg", (0.0, 15.0)),
+        ("tip_arc_turn_deg", (1.0, 90.0)),
+        ("pressure_angle_deg", (15.0, 60.0)),
+        ("trochoid_ratio", (0.0, 2.0)),
+        ("coefficients", (-1.0, 1.0)),
+        ("some_other_angle_deg", (0.0, 90.0)),
+    ],
+)
+def test_ranges_of_parameters_that_a_config_leaves_open(key, ends):
     """Lengths scale with the pitch radius and the tip land with the lobe pitch.
 
     Every other parameter has the range of its kind; no length is negative."""
     other = Parameter("some_other_angle_deg", "an angle", 0, 180)
-    expected = {
-        "arc_center_mm": (15.0, 29.97),
-        "rolling_radius_mm": (0.3, 45.0),
-        "edge_radius_mm": (0.3, 45.0),
-        "tip_arc_angle_deg": (0.0, 15.0),
-        "tip_arc_turn_deg": (1.0, 90.0),
-        "pressure_angle_deg": (15.0, 60.0),
-        "trochoid_ratio": (0.0, 2.0),
-        "coefficients": (-1.0, 1.0),
-        "some_other_angle_deg": (0.0, 90.0),
-    }
-    for key, pair in expected.items():
-        found = (parameters() | {other.key: other})[key].usually(30.0, 3)
-        assert found == pytest.approx(pair), key
+    assert parameters().get(key, other).usually(30.0, 3) == pytest.approx(ends)
 
 
-def test_usual_ranges_follow_the_scene():
+@pytest.mark.parametrize(
+    ("name", "overrides", "key", "ends"),
+    [
+        ("cic_drawn", [], SPEED, (2400.0, 3600.0)),
+        ("cic_drawn", [], "scene.timing_gear.backlash_mm", (0.05, 0.15)),
+        ("cic_drawn", ["scene.timing_gear=null"], "scene.timing_gear.backlash_mm", None),
+        ("cic_drawn", [], CLEARANCE, (0.0, 0.015)),
+        ("cic_drawn", ["contact.clearance_mm=0.04"], CLEARANCE, (0.02, 0.06)),
+        ("pump", [], "scene.load.pressure_difference_Pa", (3e4, 8e4)),
+        ("pump", [], "scene.load.torque_N_m", None),
+        # What the config does not allow is left out, unless the user asks for it.
+        ("cic_drawn", ["scene.speed_rpm=9.5e5"], SPEED, None),
+        ("cic_drawn", ["objective.speeds_rpm=[2000, 3000]"], SPEED, None),
+        ("cic_drawn", ["assumptions.scenes=0"], CLEARANCE, None),
+    ],
+)
+def test_usual_ranges_follow_the_scene(name, overrides, key, ends):
     """A scene varies what it has; the clearance stays above 0, by 15 µm or by half of it."""
-    own = ranges()
-    assert own[SPEED] == (2400.0, 3600.0)
-    assert own["scene.timing_gear.backlash_mm"] == pytest.approx((0.05, 0.15))
-    assert own[CLEARANCE] == pytest.approx((0.0, 0.015))
-    assert ranges("contact.clearance_mm=0.04")[CLEARANCE] == pytest.approx((0.02, 0.06))
-    assert not [key for key in ranges("scene.timing_gear=null") if "gear" in key]
-    gas = ranges(name="pump")
-    assert gas["scene.load.pressure_difference_Pa"] == pytest.approx((3e4, 8e4))
-    assert "scene.load.torque_N_m" not in gas
-    # What the config does not allow is left out, unless the user asks for it.
-    assert SPEED not in ranges("scene.speed_rpm=9.5e5")
-    assert SPEED not in ranges("objective.speeds_rpm=[2000, 3000]")
-    assert ranges("assumptions.scenes=0") == {}
+    assert ranges(*overrides, name=name).get(key) == pytest.approx(ends)
 
 
 def test_own_ranges_replace_the_usual_ones():

@@ -16,7 +16,6 @@ SPEED = 314.0
 
 
 def nothing(part, motion, own):
-    """Return 0: no energy, no power."""
     return jnp.zeros(())
 
 
@@ -29,8 +28,9 @@ def draw(part, rng, reach, axes):
         start = part.start(UNITS)
         own = jnp.asarray(own if start is None else own + np.asarray(start))
     turns, apart, rate_apart, faster = rng.uniform(0, 2), *(reach * rng.normal(size=3))
-    numbers = turns, angle * apart, rate * rate_apart, SPEED + rate * faster
-    motion = Motion(*map(jnp.asarray, numbers))
+    motion = Motion(
+        *map(jnp.asarray, (turns, angle * apart, rate * rate_apart, SPEED + rate * faster))
+    )
     if part.displaces or axes:
         shift, drift = 1e-5 * rng.normal(size=(2, 2, 2)) * np.array([1, 100]).reshape(2, 1, 1)
         if part.displaces:
@@ -39,17 +39,6 @@ def draw(part, rng, reach, axes):
     forces = None if motion.shift is None else jnp.asarray(100 * rng.normal(size=(2, 2)))
     torques = 5 * rng.normal(size=2)
     return motion, own, Loads(jnp.asarray(torques[0]), jnp.asarray(torques[1]), forces)
-
-
-def actions(part, motion, own, loads):
-    """Return everything the part does: torques, forces and rates of its own states, as one
-    vector."""
-    found = [part.torque_on_1(motion, own), part.torque_on_2(motion, own)]
-    if motion.shift is not None:
-        found.append(part.force_on_axes(motion, own))
-    if part.states:
-        found.append(part.rates(motion, own, loads))
-    return jnp.concatenate([jnp.zeros(1), *(jnp.ravel(x) for x in found if x is not None)])
 
 
 def check_part(part, energy=nothing, supply=nothing, losses=nothing, reach=2.0, axes=False):
@@ -123,8 +112,15 @@ def _check_kinks(part, rng, reach, axes):
     lines = [[draw(part, rng, 2 * reach, axes) for _ in range(2)] for _ in range(6)]
 
     def function(point):
+        """Return everything the part does as one vector, and its flags."""
         motion, own, loads = point
-        return actions(part, motion, own, loads), part.switches(motion, own)
+        found = [jnp.zeros(1), part.torque_on_1(motion, own), part.torque_on_2(motion, own)]
+        if motion.shift is not None:
+            found.append(part.force_on_axes(motion, own))
+        if part.states:
+            found.append(part.rates(motion, own, loads))
+        actions = jnp.concatenate([jnp.ravel(x) for x in found if x is not None])
+        return actions, part.switches(motion, own)
 
     for values, slopes, flags in along(function, lines):
         missed = unmarked(values, slopes, flags)
@@ -133,10 +129,10 @@ def _check_kinks(part, rng, reach, axes):
 
 def _check_drag(part):
     speeds = np.random.default_rng(2).normal(size=50) * np.geomspace(1e-3, 10, 50)
-    drag = jax.jit(jax.vmap(lambda v: part.drag(jnp.asarray(100.0), v)))(jnp.asarray(speeds))
+    normal = jnp.asarray(100.0)
+    drag = jax.jit(jax.vmap(lambda v: part.drag(normal, v)))(jnp.asarray(speeds))
     assert np.all(np.asarray(drag) * speeds >= 0)
     lines = [(-far, far) for far in (0.01, 0.3, 10.0)]
-    normal = jnp.asarray(100.0)
     found = along(lambda v: (part.drag(normal, v)[None], part.drag_switches(v)), lines)
     for values, slopes, flags in found:
         assert unmarked(values, slopes, flags).size == 0, "kinks that no switch marks"
@@ -174,16 +170,13 @@ def check_in_pair(pair, part, reach=2.0):
     assert after[1] > before[1]
     assert after[2] == before[2] + len(jax.tree.leaves(part))
     assert len(with_part.state_names) == with_part.states
-    rng = np.random.default_rng(4)
-    states = jnp.asarray(reach * rng.normal(size=(12, with_part.states)))
+    states = reach * np.random.default_rng(4).normal(size=(12, with_part.states))
 
     @jax.jit
+    @jax.jacfwd
     def slopes(part):
-        def motion(part):
-            held = dataclasses.replace(pair, parts=(*pair.parts, part))
-            return jax.lax.map(lambda y: held.derivative(jnp.asarray(0.3), y)[0], states)
-
-        return jax.jacfwd(motion)(part)
+        held = dataclasses.replace(pair, parts=(*pair.parts, part))
+        return jax.lax.map(lambda y: held.derivative(jnp.asarray(0.3), y)[0], jnp.asarray(states))
 
     for leaf in jax.tree.leaves(slopes(part)):
         assert np.all(np.isfinite(leaf))

@@ -6,9 +6,7 @@ import functools
 import importlib
 import json
 import re
-import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -19,6 +17,7 @@ import pytest
 
 from experiments._common.shooting import closed, differentiated, forces_near
 from rootsopt import steady_response
+from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.config.families import (
     Family,
@@ -29,16 +28,14 @@ from rootsopt.config.families import (
 )
 from rootsopt.config.sources import import_named
 from rootsopt.dynamics.parts import Context
-from rootsopt.errors import InputError
 from rootsopt.scene import Scene
 from rootsopt.scene.families import profile_of
 from rootsopt.status import Status
 from tests.conformance import families as suite
 from tests.conformance.laws import check_law
 from tests.conformance.parts import check_in_pair, check_part
-from tests.standins import for_a_time
+from tests.standins import ROOT, for_a_time, refusal
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```python ?(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
@@ -66,29 +63,20 @@ def blunt_cycloid(tmp_path_factory):
         yield imported("blunt_cycloid.py", tmp_path_factory.mktemp("family"), 60)
 
 
-@pytest.fixture(scope="module")
-def early_fall(blunt_cycloid):
-    """Return the path of the file of the family given by its law, after importing it."""
-    return imported("early_fall.py", blunt_cycloid.parent, 35)
-
-
-def test_law_of_the_roll_angle_gives_the_closed_form(early_fall):
-    """With an even fall, the family is the blunt cycloid, to 1e-9 pitch radii."""
+def test_family_given_by_its_law(blunt_cycloid):
+    """It conforms; with an even fall it is the blunt cycloid, to 1e-9 pitch radii."""
+    imported("early_fall.py", blunt_cycloid.parent, 35)
+    suite.curve_is_the_one_its_normals_say("early_fall")
     nu = jnp.linspace(0.0, 1.5, 7)
 
     @functools.partial(jax.jit, static_argnums=0)
     def values(name, *design):
-        profile = profile_of(name, 3, jnp.asarray(1.0), jnp.asarray(design))
-        return jax.vmap(lambda nu: jnp.stack([profile.lever(nu), profile.support(nu)]))(nu)
+        made = profile_of(name, 3, jnp.asarray(1.0), jnp.asarray(design))
+        return jax.vmap(lambda nu: jnp.stack([made.lever(nu), made.support(nu)]))(nu)
 
     even, other = (values("early_fall", 3.0, 20.0, fall) for fall in (0.0, 0.3))
     np.testing.assert_allclose(even, values("blunt_cycloid", 3.0, 20.0), atol=1e-9)
     assert np.max(np.abs(other - even)) > 1e-2
-
-
-@pytest.mark.parametrize("holds", [one for one in suite.CHECKS if "curve" in one.__name__])
-def test_family_given_by_its_law_conforms(early_fall, holds):
-    holds(early_fall.stem)
 
 
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
@@ -96,17 +84,19 @@ def test_family_conforms(blunt_cycloid, holds):
     holds(blunt_cycloid.stem)
 
 
-DESIGN = (
-    *("--set", "profile.family=blunt_cycloid", "--set", "profile.tip_arc_angle_deg=3"),
-    *("--set", "profile.crossing_angle_deg=20"),
-)
+def another(name, path):
+    """Write the file of the blunt cycloid to `path`, for a family called `name`."""
+    text = block_of("blunt_cycloid.py", 60).replace("blunt_cycloid", name)
+    path.write_text(text, encoding="utf-8")
 
 
-def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
-    call = [sys.executable, "-m", "rootsopt.profile", "configs/ee.yaml", "--no-figures", *DESIGN]
-    call += ["-o", str(tmp_path / "out"), "--import", str(blunt_cycloid)]
-    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert done.returncode == 0, done.stderr
+def test_family_is_known_to_a_command_by_its_file(tmp_path):
+    another("filed_cycloid", tmp_path / "filed.py")
+    call = ["configs/ee.yaml", "--no-figures", "--import", str(tmp_path / "filed.py")]
+    for change in ("family=filed_cycloid", "tip_arc_angle_deg=3", "crossing_angle_deg=20"):
+        call += ["--set", f"profile.{change}"]
+    with for_a_time():
+        assert profile.main([*call, "-o", str(tmp_path / "out")]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
     assert result["design"] == {"tip_arc_angle_deg": 3.0, "crossing_angle_deg": 20.0}
     assert min(result["margins"].values()) >= 0
@@ -125,17 +115,13 @@ def test_file_that_fails_is_one_line(tmp_path, text, words):
     path = tmp_path / "broken.py"
     if text is not None:
         path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=re.escape(words)) as caught:
-        import_named(str(path))
-    assert "--import" in str(caught.value)
-    assert "\n" not in str(caught.value)
+    message = refusal(import_named, str(path))
+    assert words in message
+    assert "--import" in message
 
 
 def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
-    (tmp_path / "offered.py").write_text(
-        block_of("blunt_cycloid.py", 60).replace("blunt_cycloid", "offered_cycloid"),
-        encoding="utf-8",
-    )
+    another("offered_cycloid", tmp_path / "offered.py")
     folder = tmp_path / "offered-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: offered\nVersion: 1.0\n")
@@ -147,12 +133,12 @@ def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
         assert config.profile.family == "offered_cycloid"
 
 
-def made(lobes, pitch_radius, depth):
-    """Stand in for a maker that is never called."""
-
-
 DEPTH = Parameter("depth_mm", "a depth", 1, 9, usual=(2, 3))
-GOOD = {"name": "mine", "help": "mine", "maker": made, "parameters": (DEPTH,)} | {
+GOOD = {
+    "name": "mine",
+    "help": "mine",
+    "maker": lambda lobes, pitch_radius, depth: None,
+    "parameters": (DEPTH,),
     "example": {"depth_mm": 2.0},
     "remedy": "dig",
 }
@@ -220,7 +206,6 @@ def test_scripts_of_the_page_run(page, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def model():
-    """Return a scene of the paper's pair with a part and a law from outside the package."""
     return Scene.from_config(load("configs/cic_drawn.yaml", ["solver.accuracy=1e-7"]))
 
 

@@ -43,7 +43,7 @@ def _states(pair, count):
     states = 0.3 * draw.normal(size=(count, pair.states))
     states[:, 0] = draw.uniform(-1.5, 0.5, count)
     states[:, 1] *= 20
-    return zip(jnp.asarray(tau), jnp.asarray(states), strict=True)
+    return jnp.asarray(tau), jnp.asarray(states)
 
 
 def _near(pair, normals):
@@ -61,23 +61,21 @@ def test_margins_have_the_sign_of_the_flags(name):
     assert isinstance(pair.contact, SearchContact)
 
     @eqx.filter_jit
-    def both(pair, tau, state):
-        searched = pair.margins(tau, state)
-        return searched, _near(pair, searched.places.normal2).margins(tau, state)
+    def both(pair, *states):
+        def at(state):
+            searched = pair.margins(*state)
+            near = _near(pair, searched.places.normal2).margins(*state)
+            return searched.counts, searched.values > 0, near.values > 0
+
+        return jax.lax.map(at, states)
 
     jumps = set(kinds(pair).jump) - {-1}
     assert len(jumps) == (pair.flanks if pair.contact.jumps else 0)
-    seen = 0
-    for tau, state in _states(pair, 60):
-        searched, near = both(pair, tau, state)
-        counted = np.array(searched.counts)
-        # The margin of a jump needs the other root, which is known at the event alone.
-        counted[list(jumps)] = False
-        seen += counted.sum()
-        np.testing.assert_array_equal(
-            searched.values[counted] > 0, np.asarray(near.values > 0)[counted]
-        )
-    assert seen > 100
+    counts, searched, near = map(np.array, both(pair, *_states(pair, 60)))
+    # The margin of a jump needs the other root, which is known at the event alone.
+    counts[:, list(jumps)] = False
+    assert counts.sum() > 100
+    np.testing.assert_array_equal(searched[counts], near[counts])
 
 
 @pytest.mark.parametrize(
@@ -96,12 +94,13 @@ def test_equation_near_a_root_is_that_of_the_search(name):
         return _near(pair, own.normal2).derivative(tau, state)[0]
 
     @eqx.filter_jit
-    def both(*at):
-        return [(found(*at), jax.jacfwd(found, 2)(*at)) for found in (searched, near)]
+    def each(found, pair, *states):
+        return jax.lax.map(lambda at: (found(pair, *at), jax.jacfwd(found, 2)(pair, *at)), states)
 
-    for tau, state in _states(pair, 25):
-        for one, other in zip(*both(pair, tau, state), strict=True):
-            np.testing.assert_allclose(other, one, rtol=0, atol=2e-6 * np.max(np.abs(one)))
+    found = (each(function, pair, *_states(pair, 25)) for function in (searched, near))
+    for one, other in zip(*found, strict=True):
+        size = np.max(np.abs(one), axis=tuple(range(1, one.ndim)), keepdims=True)
+        np.testing.assert_allclose(other / size, one / size, rtol=0, atol=2e-6)
 
 
 def test_root_at_the_end_of_a_segment_has_one_slope():

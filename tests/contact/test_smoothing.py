@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from experiments._common.scenes import SHAKY
-from rootsopt.config import load
+from rootsopt import Status, load_config
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.status import Status
 
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 STIFF = (
@@ -28,7 +27,7 @@ SCENES = {
 
 def forces(name, *changes):
     path, own = SCENES[name]
-    config = load(f"configs/{path}.yaml", [*own, *changes])
+    config = load_config(f"configs/{path}.yaml", [*own, *changes])
     found = Evaluator.of(config)(series=False)
     assert found.status is Status.PERIODIC
     return np.array([found.response[key] for key in FORCES]), config.contact.rounding_mm
@@ -45,7 +44,7 @@ def test_default_smoothing_does_not_change_the_forces(name):
 
 
 def length_of(*changes):
-    return load("configs/cic_drawn.yaml", changes).contact.rounding_mm
+    return load_config("configs/cic_drawn.yaml", changes).contact.rounding_mm
 
 
 def test_smoothing_length_follows_the_scene():
@@ -54,7 +53,7 @@ def test_smoothing_length_follows_the_scene():
     A given length is kept, and the resolved config contains the number."""
     shipped = sorted(Path("configs").glob("*.yaml"))
     assert len(shipped) >= 6
-    assert {load(path).contact.rounding_mm for path in shipped} == {1e-4}
+    assert {load_config(path).contact.rounding_mm for path in shipped} == {1e-4}
     assert length_of(*STIFF) == pytest.approx(0.05 * 2.09 / 4.2e5 * 33, rel=0.05)
     depth = (4.775 / 0.033 / 1e7) ** (1 / 2.2)
     for changes, found, within in (
@@ -66,4 +65,4 @@ def test_smoothing_length_follows_the_scene():
         ("contact.smoothing_mm=0", 0.0, 0),
     ):
         assert length_of(changes) == pytest.approx(found, rel=within, abs=0)
-    assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic_drawn.yaml", STIFF).to_yaml()
+    assert f"smoothing_mm: {length_of(*STIFF)!r}" in load_config("cic_drawn", STIFF).to_yaml()

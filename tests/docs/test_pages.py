@@ -10,15 +10,20 @@ import json
 import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
+from collections import namedtuple
 
 import pytest
 
 import rootsopt
+from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.scene import check_geometry
-from tests.docs.blocks import DOCS, ROOT, blocks_of, in_process, in_python, in_shell
+from tests.standins import ROOT
 
+DOCS = ROOT / "docs"
 PAGES = [
     "index",
     "tutorial",
@@ -34,13 +39,58 @@ NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.md"))
 CELL = "{code-cell}"
 
 
+# A fenced block, with the words after its language.
+Fence = namedtuple("Fence", "language words text")
+
+
+def blocks_of(page):
+    """Return the fenced blocks of a page, in order."""
+    found = re.findall(r"^```([^\s`]*)[ ]*([^\n`]*)\n(.*?)^```$", page.read_text(), re.M | re.S)
+    return [Fence(*one) for one in found]
+
+
+def in_shell(text, folder):
+    """Run shell commands in a folder, where `rootsopt` is the package of this tree."""
+    program = f'set -e\nrootsopt() {{ "{sys.executable}" -m rootsopt "$@"; }}\n{text}'
+    return _run(["bash", "-c", program], folder)
+
+
+def in_process(text, folder, capsys, monkeypatch):
+    """Run the `rootsopt` commands of a shell block in this process and in a folder."""
+    monkeypatch.chdir(folder)
+    lines = text.replace("\\\n", " ").splitlines()
+    codes = [main(shlex.split(line)[1:]) for line in lines if line.startswith("rootsopt ")]
+    return subprocess.CompletedProcess(text, codes[-1], *capsys.readouterr())
+
+
+def in_python(text, folder):
+    """Run Python in a process and folder of its own, without a display."""
+    file = folder / "page.py"
+    file.write_text(text)
+    return _run([sys.executable, str(file)], folder)
+
+
+def _run(command, folder):
+    places = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    extra = {"PYTHONPATH": os.pathsep.join(places), "MPLBACKEND": "Agg"}
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env={**os.environ, **extra},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=1800,
+    )
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_code_is_executed_or_named_as_not_executed(name):
-    known = {"run", "fails", "skip", "rotor.yaml"}
     for block in blocks_of(DOCS / f"{name}.md"):
         if not block.language.startswith("{"):  # A directive.
             assert block.language in ("sh", "python", "yaml"), block
-            assert block.words in known, f"{name}: say whether this block is run:\n{block.text}"
+            told = block.words in {"run", "fails", "skip", "rotor.yaml"}
+            assert told, f"{name}: say whether this block is run:\n{block.text}"
 
 
 def _ended(done, block, page):
@@ -68,16 +118,24 @@ def test_page_begins(name, tmp_path, capsys, monkeypatch):
     assert {"profile_design.csv", "rotor.dxf"} <= {*os.listdir(tmp_path / "geometry")}
 
 
+def _all_run(name, folder):
+    """Write the files of a page into a folder, run its blocks there, and return its text."""
+    blocks = blocks_of(DOCS / f"{name}.md")
+    assert "run" in {block.words for block in blocks}
+    page = (DOCS / f"{name}.md").read_text()
+    for block in blocks:
+        if block.words.endswith(".yaml"):
+            (folder / block.words).write_text(block.text)
+        elif block.words in ("run", "fails"):
+            run = in_python if block.language == "python" else in_shell
+            _ended(run(block.text, folder), block, page)
+    return page
+
+
 @pytest.mark.long
 def test_tutorial(tmp_path):
     """All steps, and the numbers that the page prints."""
-    page = (DOCS / "tutorial.md").read_text()
-    for block in blocks_of(DOCS / "tutorial.md"):
-        if block.language == "yaml":
-            (tmp_path / block.words).write_text(block.text)
-        elif block.words != "skip":
-            run = in_python if block.language == "python" else in_shell
-            _ended(run(block.text, tmp_path), block, page)
+    page = _all_run("tutorial", tmp_path)
     result = json.loads((tmp_path / "better" / "result.json").read_text())
     rows = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
     assert len(rows) == 5
@@ -94,10 +152,7 @@ def test_tutorial(tmp_path):
 @pytest.mark.long
 def test_identify_page(tmp_path):
     """The record that the page makes leads to the pump that the page names."""
-    for block in blocks_of(DOCS / "identify.md"):
-        if block.words == "run":
-            run = in_python if block.language == "python" else in_shell
-            _ended(run(block.text, tmp_path), block, "")
+    _all_run("identify", tmp_path)
     known = json.loads((tmp_path / "found" / "result.json").read_text())["parameters"]
     for key, true in (("backlash_mm", 0.14), ("damping_ratio", 0.3)):
         low, high = known[f"scene.timing_gear.{key}"]["interval_95"]
@@ -106,16 +161,12 @@ def test_identify_page(tmp_path):
 
 @pytest.mark.long
 def test_howto(tmp_path):
-    blocks = [one for one in blocks_of(DOCS / "howto.md") if one.words == "run"]
-    assert blocks
-    for block in blocks:
-        _ended(in_python(block.text, tmp_path), block, "")
+    _all_run("howto", tmp_path)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
 def test_notebook(page, tmp_path):
-    """All cells run, one after another."""
     cells = [block.text for block in blocks_of(page) if block.language == CELL]
     assert len(cells) >= 4
     assert max(len(line) for cell in cells for line in cell.splitlines()) <= 88
@@ -191,7 +242,6 @@ PACKAGES = [
 
 
 def code_in(text):
-    """Return the code spans of a text."""
     return re.findall(r"`([^`]*)`", text)
 
 

@@ -3,14 +3,13 @@
 import itertools
 import json
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rootsopt.config import load
+from rootsopt import Status, load_config
 from rootsopt.contact.law import ImpactLaw, force_rounding
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Orbit
@@ -18,18 +17,13 @@ from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.steady import final, is_consistent, is_idle, is_steady
 from rootsopt.response.evaluation import Evaluator, _motion
-from rootsopt.scene import Scene, design_vector
-from rootsopt.status import Status
 
 
 def config_of(**changes):
     """Return the shipped CIC scene with changed keys, `__` for a dot."""
-    return load(
+    return load_config(
         "configs/cic_drawn.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()]
     )
-
-
-pair_of = eqx.filter_jit(Scene.pair)
 
 
 # The contact law at the ends of its ranges
@@ -90,16 +84,15 @@ def test_steps_follow_the_scene(speed, stiffness):
 
     Steps of that length do not use up the allowed number."""
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
-    pair = pair_of(Scene.from_config(config), design_vector(config))
+    pair = Evaluator.of(config).pair(config.design)
     control = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair)
-    times = pair.timescales
-    first, longest = float(control.first), float(control.base.dtmax)
-    assert first == pytest.approx(min(1e-3, float(times.swing / pair.mesh_period) / 20))
-    fall = float(times.fall / pair.mesh_period)
-    assert longest == pytest.approx(min(1 / 32, max(fall / 8, 4 / 4096)))
+    swing, fall = (x / pair.mesh_period for x in (pair.timescales.swing, pair.timescales.fall))
+    found = float(control.first), float(control.base.dtmax)
+    expected = min(1e-3, float(swing) / 20), min(1 / 32, max(float(fall) / 8, 4 / 4096))
+    assert found == pytest.approx(expected)
     if speed == 1:
-        assert first < 1e-7
-        assert longest == 4 / 4096
+        assert found[0] < 1e-7
+        assert found[1] == 4 / 4096
 
 
 # What counts as a result
@@ -214,8 +207,8 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
     """Newton's equations are then singular, and the state is kept."""
     scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
     scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
-    config = config_of(**scene, contact__clearance_mm=0.01)
-    assert Evaluator.of(config)(series=False).status is Status.IDLE
+    evaluator = Evaluator.of(config_of(**scene, contact__clearance_mm=0.01))
+    assert evaluator(series=False).status is Status.IDLE
 
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
@@ -255,7 +248,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
     })  # fmt: skip
     evaluation = Evaluator.of(config)(series=False)
     assert evaluation.status is Status.PERIODIC
-    pair = pair_of(Scene.from_config(config), design_vector(config))
+    pair = Evaluator.of(config).pair(config.design)
 
     @jax.jit
     def rates(tau, state):
@@ -278,7 +271,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
 def test_a_tightened_tolerance_does_no_worse():
     """At the cusp of EE, finer meshes gain nothing. The forces are reported with their error."""
     usual, tight = (
-        Evaluator.of(load("configs/paper_ee.yaml", [f"solver.rtol={rtol}"]))(series=False)
+        Evaluator.of(load_config("configs/paper_ee.yaml", [f"solver.rtol={rtol}"]))(series=False)
         for rtol in (1e-8, 1e-10)
     )
     assert tight.status is usual.status is Status.PERIODIC

@@ -1,7 +1,5 @@
 """Tests of gradients of closed orbits against central differences of orbits."""
 
-from operator import attrgetter
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,22 +36,23 @@ def errors(config, levels=3):
     """Return the error of each response's derivatives with respect to the design, relative to the
     greatest of them, by name. `levels`: number of steps of the differences."""
     evaluator, columns = Evaluator.of(config), []
-    here = evaluator(series=False)
-    assert here.status is Status.PERIODIC
-    design = np.array(list(here.design.values()))
+    here, design = evaluator(series=False), config.design
     for unit in np.diag(design):
 
         def responses(change, unit=unit):
             found = evaluator(design + change * unit, start=here.start, series=False)
-            assert found.status is Status.PERIODIC
+            assert found.status is here.status is Status.PERIODIC
             return np.array(list(found.response.values()))
 
         columns.append(differentiated(responses, STEP, levels)[0])
-    found = {}
-    for name, truth in zip(here.response, np.stack(columns, axis=1), strict=True):
-        if np.any(truth):  # not a line between those of an orbit that repeats every mesh period
-            off = np.abs(design * list(here.gradient[name].values()) - truth)
-            found[name] = np.max(off) / np.max(np.abs(truth))
+    truths = dict(zip(here.response, np.stack(columns, axis=1), strict=True))
+    # Without a line between those of an orbit that repeats every mesh period.
+    found = {
+        name: np.max(np.abs(design * list(here.gradient[name].values()) - truth))
+        / np.max(np.abs(truth))
+        for name, truth in truths.items()
+        if np.any(truth)
+    }
     assert len(found) == 7
     return found
 
@@ -93,13 +92,13 @@ def test_ee(scene, lobes):
     for key in OF_SCENE:
 
         def pair(change, key=key):
-            moved = config.replaced({key: attrgetter(key)(config) * (1 + change)})
+            moved = config.replaced({key: config.value(key) * (1 + change)})
             return Evaluator.of(moved).pair([])
 
         columns.append(differentiated(forces_near(pair, orbit, 1), STEP)[0])
     assert here.steady_state["period"] == 1
     for name, truth in zip(FORCES, np.stack(columns, axis=1), strict=True):
-        slope = [gradient[name][key] * attrgetter(key)(config) for key in OF_SCENE]
+        slope = [gradient[name][key] * config.value(key) for key in OF_SCENE]
         assert slope == pytest.approx(truth, abs=1e-6 * np.max(np.abs(truth)))
 
 
@@ -154,7 +153,7 @@ def test_contact_jumps_beside_a_joint():
     assert max(found.values()) < 1e-5, found
 
 
-@pytest.mark.parametrize(("lobes", "depth"), [(2, 4e-3), (3, 1e-4), (4, 1.2e-3)])
+@pytest.mark.parametrize(("lobes", "depth"), [(3, 1e-4), (4, 1.2e-3)])
 def test_jump_is_a_switch(lobes, depth):
     """A switch changes where the contact jumps beside a cusp, twice in a mesh period.
 

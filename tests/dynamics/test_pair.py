@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import load
+from rootsopt import Scene, Status, load_config
 from rootsopt.dynamics.parts import ConstantLoad, Friction, Motion, MotorDrive
 from rootsopt.dynamics.steady import TOO_DEEP
-from rootsopt.scene import Scene, design_vector, outline_mm
-from rootsopt.status import Status
+from rootsopt.scene import outline_mm
 from tests.scene.test_scene import MOTOR, pair_of
 from tests.standins import HALF_BACKLASH, INERTIA, LOAD, LOBES, SCALE, SPEED, Near, oscillator
 
@@ -19,7 +18,7 @@ GAS = ["scene.load={pressure_difference_Pa: 4e4}"]
 
 @pytest.mark.parametrize(
     ("family", "overrides"),
-    [("cic_drawn", ["profile.involute_length_mm=7"]), ("ee", []), ("ee", ["profile.lobes=2"])],
+    [("cic_drawn", ["profile.involute_length_mm=7"]), ("ee", ["profile.lobes=2"])],
 )
 def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     """Over a revolution, both rotors together take Δp times the displaced volume / 2π.
@@ -27,8 +26,8 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     The volume is twice the difference of the bore and the rotor, from the outline's polygon."""
     pair, config = pair_of([*GAS, *overrides], family)
     phi = np.linspace(0, 2 * np.pi, 60001)[:-1] + 1e-6
-    torques = pair.load.torque1, pair.load.torque2
-    means = [np.mean(jax.jit(jax.vmap(torque))(phi)) for torque in torques]
+    both = jax.jit(jax.vmap(lambda phi: (pair.load.torque1(phi), pair.load.torque2(phi))))
+    means = np.mean(both(phi), axis=1)
     x, y = 1e-3 * outline_mm(config).T
     area = abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
     volume = 2 * (np.pi * np.max(np.hypot(x, y)) ** 2 - area) * 0.1
@@ -55,8 +54,8 @@ _slopes = eqx.filter_jit(jax.jacfwd(lambda m, d, phi: along(m, d, phi)[0], 1))
 @pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
 def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
     """This also holds at and past the longest involute, where the whole tip arc meshes at once."""
-    config = load("configs/cic_drawn.yaml", [*GAS, f"profile.involute_length_mm={length}"])
-    model, design = Scene.from_config(config), design_vector(config)
+    config = load_config("configs/cic_drawn.yaml", [*GAS, f"profile.involute_length_mm={length}"])
+    model, design = Scene.from_config(config), jnp.asarray(config.design)
     phi = jnp.linspace(0.001, 1.04, 4001)
 
     here, margins = (np.asarray(x) for x in _along(model, design, phi))
@@ -73,19 +72,21 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
         assert np.mean(abs(found - expected) > 1e-5 * np.max(abs(expected))) < 0.002
 
 
+@eqx.filter_jit
+def bends_and_flags(load, phi):
+    """Return the second derivative of the torque on rotor 2, and the flags."""
+    still, turning = jnp.zeros(()), jnp.ones(())
+    flags = jax.vmap(lambda x: load.switches(Motion(x, still, still, turning), np.zeros(0)))
+    return jax.vmap(jax.grad(jax.grad(load.torque2)))(phi), flags(phi)
+
+
 @pytest.mark.parametrize("length", [8.89, 9.0])
 def test_steps_end_where_a_spread_jump_begins_and_ends(length):
     """Wherever the slope of the torque has a kink, a flag changes. The kinks are found in the
     torque."""
     pair, _ = pair_of([*GAS, f"profile.involute_length_mm={length}"])
-    phi = jnp.linspace(0.02, 1.02, 10001)
-
-    def flags(phi):
-        still = jnp.zeros(())
-        return pair.load.switches(Motion(phi, still, still, jnp.ones(())), np.zeros(0))
-
-    bend = np.asarray(jax.jit(jax.vmap(jax.grad(jax.grad(pair.load.torque2))))(phi))
-    places = np.flatnonzero(np.any(np.diff(jax.jit(jax.vmap(flags))(phi), axis=0), axis=1))
+    bend, flags = map(np.asarray, bends_and_flags(pair.load, jnp.linspace(0.02, 1.02, 10001)))
+    places = np.flatnonzero(np.any(np.diff(flags, axis=0), axis=1))
     # The ramp over 0.01 rad bends a hundred times more than the smooth torque beside it.
     jumps = np.flatnonzero(abs(np.diff(bend)) > 0.3 * np.max(abs(bend)))
     assert len(jumps) >= 2
@@ -99,10 +100,8 @@ def test_a_motor_without_torque_of_its_own_balances_the_load():
     """A constant load acts on rotor 2 alone, gas on both rotors."""
     pair, config = pair_of(MOTOR)
     assert float(pair.drive.torque) == pytest.approx(config.scene.load.torque_N_m)
-    pair, _ = pair_of([*MOTOR, "scene.load={pressure_difference_Pa: 5e4}"])
+    pair, _ = pair_of([*MOTOR, *GAS])
     assert float(pair.drive.torque) == pytest.approx(2 * float(pair.load.torque))
-    pair, _ = pair_of(["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 1, torque_N_m: 7}"])
-    assert float(pair.drive.torque) == 7.0
 
 
 def test_a_stalled_motor_keeps_creeping():
@@ -133,7 +132,7 @@ def test_inertia_of_a_motor_turns_with_rotor_1():
 
 def test_motor_of_a_config_is_that_of_its_pair():
     motor = "scene.motor={slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
-    config = load("configs/cic_drawn.yaml", ["scene.drive=torque", motor])
+    config = load_config("configs/cic_drawn.yaml", ["scene.drive=torque", motor])
     drive = Scene.from_config(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
     assert isinstance(drive, MotorDrive)
     numbers = [float(x) for x in (drive.speed, drive.torque, drive.slope, drive.inertia)]
@@ -146,13 +145,13 @@ def test_motor_of_a_config_is_that_of_its_pair():
 def test_rotor_2_behind_touches_the_drive_flank():
     """ε < 0: rotor 2 lags, so that rotor 1 drives it forward; ε > 0: the other way about."""
     pair = oscillator(contact=Near())
-    for relative, drives in ((-1e-3, True), (1e-3, False)):
+    force = 1e9 * (0.03 * 1e-3) ** 1.5
+    for relative, drive, coast in ((-1e-3, force, 0.0), (1e-3, 0.0, force)):
         found = pair.contact_force(jnp.asarray(0.1), jnp.asarray(relative), jnp.asarray(0.0))
-        forces = float(found.drive), float(found.coast)
-        assert (forces[0] > 0, forces[1] > 0) == (drives, not drives)
-        assert float(found.total) == pytest.approx(1e9 * (0.03 * 1e-3) ** 1.5, rel=1e-12)
-        assert float(found.torque2) == pytest.approx((1 if drives else -1) * 0.03 * max(forces))
-        assert float(found.torque1) == pytest.approx(-float(found.torque2))
+        torque = 0.03 * (drive - coast)
+        expected = drive, coast, force, -torque, torque
+        shown = found.drive, found.coast, found.total, found.torque1, found.torque2
+        np.testing.assert_allclose(shown, expected, rtol=1e-12)
 
 
 def test_switches_of_a_pair_are_those_of_its_parts():
@@ -163,9 +162,8 @@ def test_switches_of_a_pair_are_those_of_its_parts():
     places = {1: 1e-7 / 0.03, 2: 1e-5 / 0.03, 6: HALF_BACKLASH, 7: HALF_BACKLASH + 1e-6}
     for side in (-1, 1):
         for number, place in places.items():
-            for share in (0.9999, 1.0001):
-                flags, _ = switches(jnp.array([side * share * place / SCALE, 0.0]))
-                assert flags[number] == (share > 1)
+            ends = (jnp.array([side * x * place / SCALE, 0.0]) for x in (0.9999, 1.0001))
+            assert [bool(switches(state)[0][number]) for state in ends] == [False, True]
         flags, counts = switches(jnp.array([side * 1e-3 / SCALE, 0.0]))
         assert flags[0]
         assert bool(flags[5]) == (side < 0)
@@ -193,5 +191,5 @@ def test_friction_is_made_of_cubic_steps():
     shares = np.clip([(speed / low + 1) / 2, (speed - low) / (high - low)], 0, 1)
     rise, fall = 3 * shares**2 - 2 * shares**3
     expected = static * (2 * rise - 1) - (static - kinetic) * fall
-    for sign in (1, -1):
-        np.testing.assert_allclose(law(jnp.asarray(sign * speed)), sign * expected, atol=1e-15)
+    found = law(jnp.asarray([speed, -speed]))
+    np.testing.assert_allclose(found, [expected, -expected], atol=1e-15)

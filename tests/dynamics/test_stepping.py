@@ -16,14 +16,12 @@ import pytest
 from jax import lax
 
 from experiments._common.shooting import closed, differentiated, forces_near
-from rootsopt.config import load
+from rootsopt import Status, load_config
 from rootsopt.dynamics.flow import integrated, interpolated, one_period
 from rootsopt.dynamics.integrator import METHODS, Integrator, LandingControl
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.steady import agreement, verdict
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.scene import Scene, design_vector
-from rootsopt.status import Status
 
 
 def swing(tau, y, gravity):
@@ -33,49 +31,53 @@ def swing(tau, y, gravity):
     return jnp.stack([y[1], -gravity * jnp.sin(jnp.where(jnp.abs(y[0]) < 1, y[0], jnp.nan))])
 
 
-def both(method, gravity, max_steps):
+@functools.partial(jax.jit, static_argnums=0)
+def both(method, gravity):
     """Return the integration by this loop, its states at the ends of diffrax's steps, and that by
     diffrax."""
+    # Angle (rad) and speed (rad per unit of time) at the start.
+    start, max_steps = jnp.array((0.3, -1.2)), 2048
     solver = Integrator(method, jnp.asarray(1e-6), max_steps).solver()
     term, control = diffrax.ODETerm(swing), diffrax.PIDController(1e-6, 1e-6, dtmax=1 / 32)
-
-    @jax.jit
-    def run(start, gravity):
-        ours = integrated(term, solver, control, start, gravity, max_steps, recorded=True)
-        theirs = diffrax.diffeqsolve(
-            term,
-            solver,
-            t0=0.0,
-            t1=1.0,
-            dt0=None,
-            y0=start,
-            args=gravity,
-            saveat=diffrax.SaveAt(t1=True, steps=True, dense=True),
-            stepsize_controller=control,
-            adjoint=diffrax.ForwardMode(),
-            max_steps=max_steps,
-            throw=False,
-        )
-        inside = jax.vmap(lambda share: interpolated(ours, solver, share)[0])
-        shown = theirs.ts, theirs.ys, theirs.stats, theirs.result == diffrax.RESULTS.successful
-        return ours, inside(jnp.minimum(theirs.ts, 1.0)), shown
-
-    # Angle (rad) and speed (rad per unit of time) at the start.
-    return run(jnp.array((0.3, -1.2)), jnp.asarray(gravity))
+    ours = integrated(term, solver, control, start, gravity, max_steps, recorded=True)
+    theirs = diffrax.diffeqsolve(
+        term,
+        solver,
+        t0=0.0,
+        t1=1.0,
+        dt0=None,
+        y0=start,
+        args=gravity,
+        saveat=diffrax.SaveAt(t1=True, steps=True, dense=True),
+        stepsize_controller=control,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=max_steps,
+        throw=False,
+    )
+    inside = jax.vmap(lambda share: interpolated(ours, solver, share)[0])
+    shown = theirs.ts, theirs.ys, theirs.stats, theirs.result == diffrax.RESULTS.successful
+    return ours, inside(jnp.minimum(theirs.ts, 1.0)), shown
 
 
 @pytest.mark.parametrize(
-    ("method", "gravity"),
-    [("tsit5", 4000.0), ("dopri8", 4000.0), ("tsit5", 1e5)],
-    ids=["order 5", "order 8", "first step leaves the domain"],
+    ("method", "gravity", "ends_well"),
+    [
+        pytest.param("tsit5", 4000.0, True, id="order 5"),
+        pytest.param("dopri8", 4000.0, True, id="order 8"),
+        pytest.param("tsit5", 1e5, True, id="first step leaves the domain"),
+        pytest.param("tsit5", 1e9, False, id="too few steps"),
+        pytest.param("tsit5", np.nan, False, id="not a number"),
+    ],
 )
-def test_steps_are_those_of_diffrax(method, gravity):
-    ours, inside, (ends, after, stats, solved) = both(method, gravity, max_steps=2048)
+def test_steps_are_those_of_diffrax(method, gravity, ends_well):
+    """An integration that does not reach the end says so."""
+    ours, inside, (ends, after, stats, solved) = both(method, jnp.asarray(gravity))
     count = int(ours.accepted)
-    assert solved
-    assert ours.solved
-    assert (int(stats["num_steps"]), int(stats["num_accepted_steps"])) == (ours.steps, count)
-    assert count > 30
+    assert bool(ours.solved) == bool(solved) == ends_well
+    assert int(ours.steps) == int(stats["num_steps"])
+    if not ends_well:
+        return
+    assert int(stats["num_accepted_steps"]) == count > 30
     np.testing.assert_allclose(ours.records.ends[:count], ends[:count], rtol=1e-12)
     np.testing.assert_allclose(inside[:count], after[:count], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(ours.end, inside[count - 1], rtol=1e-12)
@@ -83,20 +85,10 @@ def test_steps_are_those_of_diffrax(method, gravity):
     assert np.all(np.isinf(ours.records.ends[count:]))
 
 
-@pytest.mark.parametrize(
-    ("gravity", "max_steps"), [(4000.0, 20), (np.nan, 2048)], ids=["too few steps", "not a number"]
-)
-def test_an_integration_that_does_not_reach_the_end_says_so(gravity, max_steps):
-    ours, _, (_, _, stats, solved) = both("tsit5", gravity, max_steps)
-    assert not solved
-    assert not ours.solved
-    assert int(ours.steps) == int(stats["num_steps"])
-
-
 def test_solvers_agree():
-    config = load("configs/cic_drawn.yaml")
+    config = load_config("configs/cic_drawn.yaml")
     found = []
-    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
+    pair = Evaluator.of(config).pair(config.design)
     period = eqx.filter_jit(one_period)
     for method, rtol in (("tsit5", 1e-11), *((method, 1e-8) for method in METHODS)):
         how, state = Integrator(method, jnp.asarray(rtol), 20000), jnp.zeros(2)
@@ -117,14 +109,13 @@ from rootsopt.dynamics.integrator import Integrator
 
 jax.config.update("jax_enable_x64", True)
 config = rootsopt.load_config("configs/ee.yaml")
-pair = rootsopt.Scene.from_config(config).pair(config.design)
-how = Integrator("tsit5", jnp.asarray(1e-8), 1024)
-state = jnp.zeros(2)
-programs = (
-    lambda state: strobe(pair, state, 4, how),
-    lambda state: one_period(pair, state, how),
-)
-print([str(jax.make_jaxpr(program)(state)).count("callback") for program in programs])
+scene, how = rootsopt.Scene.from_config(config), Integrator("tsit5", jnp.asarray(1e-8), 1024)
+
+def program(design, state):
+    pair = scene.pair(design)
+    return strobe(pair, state, 4, how), one_period(pair, state, how)
+
+print(str(jax.make_jaxpr(program)(config.design, jnp.zeros(2))).count("callback"))
 """
 
 
@@ -136,38 +127,15 @@ def test_no_callback_to_python_in_an_integration():
     variables = {name: x for name, x in os.environ.items() if name != "EQX_ON_ERROR"}
     command = [sys.executable, "-c", _COUNT]
     done = subprocess.run(command, env=variables, check=True, capture_output=True, text=True)
-    assert done.stdout == "[0, 0]\n"
+    assert done.stdout == "0\n"
 
 
-@pytest.mark.parametrize("taken", [[True] * 3, [False] * 3, [True, False, True]])
-def test_branches_of_a_batch_on_a_gpu(monkeypatch, taken):
+@pytest.mark.parametrize("limits", [[3, 500, 5], [500] * 3])
+def test_branches_of_a_batch_on_a_gpu(monkeypatch, limits):
+    """A branch that no motion takes is left out, and a motion that does not take a branch does not
+    prolong its loops."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    made = set()
-
-    def told(name, value):
-        jax.debug.callback(lambda: made.add(name))
-        return value
-
-    def one(taken, x):
-        return branch(taken, lambda: told("then", 2 * x), lambda: told("otherwise", -x))
-
-    values = jnp.arange(1.0, 4.0)
-    found = jax.jit(jax.vmap(one))(jnp.asarray(taken), values)
-    jax.effects_barrier()
-    np.testing.assert_array_equal(found, jnp.where(jnp.asarray(taken), 2 * values, -values))
-    assert made == {"then" if now else "otherwise" for now in taken}
-    # A condition that is the same for the whole batch, and a branch without batched values.
-    shared = jax.jit(jax.vmap(one, (None, 0)))(taken[1], values)
-    np.testing.assert_array_equal(shared, 2 * values if taken[1] else -values)
-    fixed = jax.vmap(lambda now: branch(now, lambda: jnp.ones(2), lambda: jnp.zeros(2)))
-    np.testing.assert_array_equal(fixed(jnp.asarray(taken))[:, 0], taken)
-
-
-def test_loops_of_a_branch_end_with_the_motions_that_take_it(monkeypatch):
-    """In a batch on a GPU, a motion that does not take a branch does not prolong its loops."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    turns = []
-    count = jnp.zeros((), int)
+    turns, limits = [], np.array(limits)
 
     def counted(k):
         jax.debug.callback(lambda: turns.append(1))
@@ -175,14 +143,24 @@ def test_loops_of_a_branch_end_with_the_motions_that_take_it(monkeypatch):
 
     def one(limit):
         def loop():
-            return lax.while_loop(lambda k: k < limit, counted, count)
+            return lax.while_loop(lambda k: k < limit, counted, jnp.zeros((), int))
 
-        return branch(limit < 10, loop, lambda: count)
+        def stay():
+            return jnp.zeros((), int)
 
-    found = jax.jit(jax.vmap(one))(jnp.asarray([3, 500, 5]))
+        return branch(limit < 10, loop, stay), branch(limit >= 10, stay, loop)
+
+    found = jax.jit(jax.vmap(one))(limits)
     jax.effects_barrier()
-    np.testing.assert_array_equal(found, [3, 0, 5])
-    assert len(turns) <= 3 * 5
+    small = np.where(limits < 10, limits, 0)
+    np.testing.assert_array_equal(found, [small, small])
+    assert len(turns) <= 2 * 3 * np.max(small)
+    # A condition that is the same for the whole batch, and a branch without batched values.
+    same = jax.vmap(lambda now, x: branch(now, lambda: 2 * x, lambda: -x), (None, 0))
+    now = limits[0] < 10
+    np.testing.assert_array_equal(jax.jit(same)(now, limits), 2 * limits if now else -limits)
+    fixed = jax.vmap(lambda now: branch(now, lambda: jnp.ones(2), lambda: jnp.zeros(2)))
+    np.testing.assert_array_equal(fixed(limits < 10)[:, 0], limits < 10)
 
 
 # Free flight
@@ -192,7 +170,7 @@ def test_loops_of_a_branch_end_with_the_motions_that_take_it(monkeypatch):
 def landing(*changes) -> tuple[LandingControl, float]:
     """Return the control of steps of a scene, and its unit of angle (rad)."""
     own = ["contact.clearance_mm=0", "scene.timing_gear.backlash_mm=0.2", *changes]
-    config = load("configs/cic_drawn.yaml", own)
+    config = load_config("configs/cic_drawn.yaml", own)
     pair = Evaluator.of(config).pair(config.design)
     found = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair)
     assert isinstance(found, LandingControl)
@@ -211,13 +189,18 @@ def test_edges_are_those_of_clearance_and_backlash():
     assert float(landing("scene.center_distance_error_mm=0.01")[0].inside) == 0
 
 
+@eqx.filter_jit
+def _adapted(control, begin, end, before, after):
+    state = jnp.ones(()), jnp.ones(()), jnp.zeros((), bool)
+    return control.adapt_step_size(begin, end, before, after, None, jnp.zeros(2), 5.0, state)[:3]
+
+
 def adapted(before, after, step):
     """Return whether a step between these states, with no error, is kept, and where the next one
     ends."""
-    begin = jnp.asarray(0.2)
-    args = begin, begin + step, jnp.asarray(before), jnp.asarray(after), None, jnp.zeros(2), 5.0
-    state = jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(False)
-    keep, start, stop, *_ = landing()[0].adapt_step_size(*args, state)
+    begin = 0.2
+    at = map(jnp.asarray, (begin, begin + step, before, after))
+    keep, start, stop = _adapted(landing()[0], *at)
     return bool(keep), float(start - begin), float(stop - begin)
 
 
@@ -230,8 +213,7 @@ def parabola(place, rate, bend, time):
 def test_the_next_step_ends_just_beyond_the_edge(place, bend):
     """The next step ends just beyond the edge ε = 0; steps of 1/32 mesh period would pass it by
     far."""
-    step = 0.004
-    rate = -12.0 * np.sign(place)
+    step, rate = 0.004, -12.0 * np.sign(place)
     roots = np.roots([bend / 2, rate, place]) if bend else np.array([-place / rate])
     meets = min(float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
     found = adapted(*(parabola(place, rate, bend, t) for t in (0.0, step)), step)
@@ -248,29 +230,26 @@ def test_a_step_that_passed_an_edge_far_is_taken_again():
 def test_a_step_ends_at_a_turn_beside_an_edge():
     """A step ends where a parabola turns 0.01 before the edge, because it might reach the edge."""
     bend, turn, step = 100.0, 0.02, 0.002
-    stops = []
-    for beyond in (0.0, 0.3):
-        begin = 0.01 + beyond + bend / 2 * turn**2, -bend * turn
-        keep, _, stop = adapted(begin, parabola(*begin, bend, step), step)
-        assert keep
-        stops.append(stop)
+    begins = [(0.01 + beyond + bend / 2 * turn**2, -bend * turn) for beyond in (0.0, 0.3)]
+    near, far = (adapted(begin, parabola(*begin, bend, step), step) for begin in begins)
+    assert near == pytest.approx((True, step, turn))
     # Far from every edge, the step is not limited.
-    assert stops[0] == pytest.approx(turn)
-    assert stops[1] > turn
+    assert far[0]
+    assert far[2] > turn
+
+
+def falling(t, y, args):
+    """Return the slope in a free fall onto a stiff floor at ε = 0."""
+    return jnp.stack([y[1], -1.0 + jnp.where(y[0] < 0, 4e6 * y[0] ** 2, 0.0)])
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-11])
 def test_a_touch_between_two_stages_is_met(rtol):
-    """A touch is found in a free fall onto a stiff floor at ε = 0, from a height at which steps are
-    long."""
-    base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=1.0)
+    """It is found in a fall from a height at which steps are long."""
+    base = diffrax.PIDController(rtol=jnp.asarray(rtol), atol=jnp.asarray(rtol), dtmax=1.0)
     control = dataclasses.replace(landing()[0], base=base)
-
-    def field(t, y, args):
-        return jnp.stack([y[1], -1.0 + jnp.where(y[0] < 0, 4e6 * y[0] ** 2, 0.0)])
-
     found = eqx.filter_jit(diffrax.diffeqsolve)(
-        diffrax.ODETerm(field),
+        diffrax.ODETerm(falling),
         diffrax.Tsit5(),
         t0=0.0,
         t1=3.0,
@@ -300,17 +279,14 @@ def test_two_changes_at_one_instant():
         "profile.involute_length_mm=5.77",
         "profile.tip_arc_angle_deg=1.68",
     ]
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+    evaluator = Evaluator.of(load_config("configs/cic_drawn.yaml", scene)).surveying()
     step, way, found = 5e-5, np.array([1.0, -0.7, 0.8]), evaluator(series=False)
     assert found.status is Status.PERIODIC
     assert found.statistics["gradient_disagreement"] < 1e-4
     # At the default tolerance, rounding alone changes the mean by 1e-8, and the difference by 1e-2.
-    sharp = evaluator.at_tolerance(1e-11)
-    slope = 0.0
-    for change in (step, -step):
-        design = jnp.asarray([35.23, 5.77, 1.68] + change * way)
-        end = sharp(design, start=found.state, series=False)
-        slope += end.response["mean_force_N"] / (2 * change)
+    sharp, design = evaluator.at_tolerance(1e-11), evaluator.config.design
+    ends = (sharp(design + x * way, start=found.state, series=False) for x in (step, -step))
+    slope = np.subtract(*(end.response["mean_force_N"] for end in ends)) / (2 * step)
     row = np.array(list(found.gradient["mean_force_N"].values()))
     assert row @ way == pytest.approx(slope, abs=1e-5 * np.max(np.abs(row)))
 
@@ -342,7 +318,7 @@ def test_the_check_bounds_the_error(scene, design):
     4e-8 mesh periods beside the corner, it was 2e-7 off in both. With values 1e-4 of an element
     beside the corner, extrapolated by a cubic, it was 2e-5 off in the second."""
     design, way = np.array(design), np.array([1.0, -0.7, 0.8])
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+    evaluator = Evaluator.of(load_config("configs/cic_drawn.yaml", scene)).surveying()
     found = {rtol: evaluator.at_tolerance(rtol)(design, series=False) for rtol in (1e-8, 1e-10)}
     state, period = found[1e-10].state, found[1e-10].steady_state["period"]
 
@@ -352,8 +328,8 @@ def test_the_check_bounds_the_error(scene, design):
     orbit = closed(pair(0.0), state, period)
     truth, noise = differentiated(forces_near(pair, orbit, period), 1e-3)
     for rtol, one in found.items():
-        rows = [list(one.gradient[f"{name}_force_N"].values()) for name in ("mean", "peak", "rms")]
-        slopes = np.array(rows) * design * way
+        rows = (one.gradient[f"{name}_force_N"].values() for name in ("mean", "peak", "rms"))
+        slopes = np.array([*map(list, rows)]) * design * way
         size = np.max(np.abs(slopes), axis=1)
         error = np.maximum(np.abs(np.sum(slopes, axis=1) - truth) - noise, 0.0) / size
         assert np.max(noise / size) < 1e-6
@@ -362,15 +338,15 @@ def test_the_check_bounds_the_error(scene, design):
         assert np.max(error) < {1e-8: 2e-7, 1e-10: 1e-7}[rtol]
 
 
-@pytest.mark.parametrize("speed", [400, 600])
-def test_many_bounces_in_a_mesh_period(speed):
-    """Some forty: with at most 160 elements, the error at 400 rpm was too large, and with 1.5
-    elements per event to begin with, Newton's method failed at both speeds."""
-    scene = ["scene.timing_gear.damping_ratio=0.1", f"scene.speed_rpm={speed}"]
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+def test_many_bounces_in_a_mesh_period():
+    """Some forty: with at most 160 elements, the error was too large, and with 1.5 elements per
+    event to begin with, Newton's method failed."""
+    scene = ["scene.timing_gear.damping_ratio=0.1", "scene.speed_rpm=400"]
+    evaluator = Evaluator.of(load_config("configs/cic_drawn.yaml", scene)).surveying()
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
-    shot = closed(evaluator.pair([*found.design.values()]), found.state, 1)
+    # Begun with the monodromy matrix 0, which is computed if that closes the orbit slowly.
+    shot = closed(evaluator.pair([*found.design.values()]), found.state, 1, np.zeros((2, 2)))
     assert [*found.response.values()][:3] == pytest.approx(shot.forces, rel=1e-6)
 
 
@@ -378,5 +354,5 @@ def test_what_is_not_certain_has_no_derivatives():
     rtol, scales = jnp.asarray(1e-8), tuple(map(jnp.asarray, (1.5, 0.033, 100.0)))
     for share, certain in ((0.9, True), (1.1, False), (np.nan, False)):
         orbit = Orbit.empty(jnp.zeros(2), 3, 3)._replace(disagreement=share * agreement(rtol))
-        found = verdict(orbit, jnp.zeros(2), (1e-3, 1e-9), (rtol, rtol), scales)
+        found = jax.jit(verdict)(orbit, jnp.zeros(2), (1e-3, 1e-9), (rtol, rtol), scales)
         assert bool(found.certain) is certain

@@ -19,8 +19,8 @@ from tests.standins import fault_of, guarded
 SECONDS = 2.0
 """CPU time (s) above which loading a config counts as a failure."""
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+# Numbers of changes made at once, drawn at random.
 _ONES = (1, 1, 1, 2, 3, 8)
-"""Numbers of changes made at once, drawn at random."""
 
 Case = tuple[bytes, tuple[str, ...]]
 """Bytes of a config file, and overrides."""
@@ -53,17 +53,12 @@ def _texts() -> tuple[list[str], list[dict]]:
     ], trees
 
 
-def _shipped(draw: random.Random) -> str:
-    return draw.choice(_texts()[0])
-
-
 def _tree(draw: random.Random) -> dict:
     return copy.deepcopy(draw.choice(_texts()[1]))
 
 
 @functools.cache
 def _keys() -> list[str]:
-    """Return all dotted keys and sections."""
     return list(tree(Config))
 
 
@@ -106,7 +101,7 @@ TAGS = (  # noqa: SIM905
 
 
 def _text(draw: random.Random) -> Case:
-    text = _shipped(draw)
+    text = draw.choice(_texts()[0])
     for _ in range(draw.choice(_ONES)):
         start = draw.randrange(len(text) + 1)
         stop = min(len(text), start + draw.choice((0, 1, 1, 2, 10, 200)))
@@ -164,7 +159,7 @@ def _structure(draw: random.Random) -> Case:
 def _values(draw: random.Random) -> Case:
     count = draw.choice(_ONES)
     pairs = (f"{draw.choice(_keys())}={_scalar(draw)[:50_000]}" for _ in range(count))
-    return _shipped(draw).encode(), tuple(pairs)
+    return draw.choice(_texts()[0]).encode(), tuple(pairs)
 
 
 CLASSES: dict[str, Callable[[random.Random], Case]] = {

@@ -107,7 +107,6 @@ def polyline(z: np.ndarray, old: bool = False, block: bool = False):
 
 @functools.cache
 def good() -> dict[str, bytes]:
-    """Return valid files by name."""
     config = load(Path(__file__).parents[2] / "configs" / "cic_drawn.yaml")
     profile = Scene.from_config(config).profile(design_vector(config))
     text = io.StringIO(dxf_bytes(Drawing.of(config, profile, {})).decode())

@@ -6,7 +6,6 @@ import json
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,15 +18,15 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of, read_rotor
 from rootsopt.optimize.design import optimize_design, pareto_front
-from rootsopt.profiles import CIC, EE, geometry, outline
+from rootsopt.profiles import CIC, EE, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
+from tests.conformance.families import measure
 from tests.standins import refusal
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
 PROFILES = {"cic": CIC3, "ee": EE(3, R)}
-every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
 CONFIG = """
 profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}"}}
 rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
@@ -39,7 +38,6 @@ scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}},
 
 # Fewer roll angles at which the gap is measured, as `setattr` takes them.
 POSES = "rootsopt.measured.conjugacy._POSES", 91
-LENGTHS = {"mm": 1.0, "inch": 25.4, "um": 1e-3, "m": 1e3}
 
 
 def cycloids(lobes, radius, count=300):
@@ -79,35 +77,25 @@ def profile_of(points, smoothing=0.0):
     return imported(Loop(points, np.zeros(len(points), bool)), 3, 1e3 * R, smoothing)
 
 
-def closed(points):
-    return np.stack([np.append(x, x[0]) for x in (points.real, points.imag)], axis=1)
-
-
 def bulged(points, by):
     above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
     return cut(points, -by * np.sin(np.pi * above) ** 2)
 
 
 @jax.jit
-def approaches(pair, rolls, relatives):
+def approaches(profile, rolls, relatives):
+    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
     return jax.lax.map(lambda pose: pair(*pose), (rolls, relatives))
 
 
-def contact_of(profile):
-    rolls = jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121)
-    places = jnp.meshgrid(rolls, jnp.array([0.0, -1e-4, -1e-3, -3e-3]))
-    return approaches(
-        FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True), *map(jnp.ravel, places)
-    )
-
-
-@every_profile
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
 def test_points_of_a_profile_give_its_contact_and_geometry(profile):
     """Gap within 1 nm, levers within 3e-4 of the pitch radius, area and inertia within 1e-9.
 
     Where arcs conform, ten digits do not determine the levers more closely."""
     found, checks = profile_of(points_of(profile))
-    truth, contact = contact_of(profile), contact_of(found)
+    poses = np.meshgrid(np.linspace(1e-3, np.pi / 3 - 1e-3, 121), [0.0, -1e-4, -1e-3, -3e-3])
+    truth, contact = (approaches(one, *map(np.ravel, poses)) for one in (profile, found))
     assert np.array_equal(truth.found, contact.found)
     assert np.count_nonzero(truth.found) > 400
     gap, there = np.asarray(contact.gap - truth.gap), np.asarray(truth.found)
@@ -115,7 +103,7 @@ def test_points_of_a_profile_give_its_contact_and_geometry(profile):
     for lever in ("lever1", "lever2"):
         off = np.asarray(getattr(contact, lever) - getattr(truth, lever))
         assert np.max(np.abs(off[there])) < 3e-4 * R
-    exact, shape = geometry(profile), geometry(found)
+    exact, shape = measure(profile), measure(found)
     for name in ("area", "polar_area_moment", "outer_radius", "root_radius"):
         assert float(getattr(shape, name)) == pytest.approx(float(getattr(exact, name)), rel=1e-9)
     assert float(shape.seal_width) == pytest.approx(float(exact.seal_width), rel=1e-3)
@@ -124,26 +112,23 @@ def test_points_of_a_profile_give_its_contact_and_geometry(profile):
     assert np.nanmax(np.abs(conjugacy(found).gap)) < 1e-9
 
 
-@every_profile
-@pytest.mark.parametrize("by", [0.02, -0.02])
-def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
+@pytest.mark.parametrize(("name", "by"), [("cic", 0.02), ("ee", -0.02)])
+def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(name, by):
     """Addenda 20 µm too thick overlap by 20 µm, as node against segment finds."""
-    points = bulged(points_of(profile), by)
+    points = bulged(points_of(PROFILES[name]), by)
     found, _ = profile_of(points)
+    polygon = np.stack([np.append(x, x[0]) for x in (points.real, points.imag)], axis=1)
 
-    def gaps(first, second):
-        pairs = zip(first, second, strict=True)
-        return [pair_gap(closed(points), 3, 2e3 * R, *pair) * 1e-3 for pair in pairs]
+    def gaps(*poses):
+        return [pair_gap(polygon, 3, 2e3 * R, *pair) * 1e-3 for pair in zip(*poses, strict=True)]
 
     rolled = conjugacy(found)
-    worst = rolled.least if by > 0 else rolled.most
-    assert worst == pytest.approx(-by * 1e-3, rel=1e-3)
+    assert (rolled.least if by > 0 else rolled.most) == pytest.approx(-by * 1e-3, rel=1e-3)
     some = slice(7, None, 59)
     assert rolled.gap[some] == pytest.approx(gaps(rolled.roll[some], rolled.roll[some]), abs=1e-9)
-    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
     x, e = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
     seen = gaps(-x - e / 2, -x + e / 2)
-    assert np.asarray(approaches(pair, x, e).gap) == pytest.approx(seen, abs=1e-9)
+    assert np.asarray(approaches(found, x, e).gap) == pytest.approx(seen, abs=1e-9)
 
 
 @pytest.mark.parametrize(("by", "scatter"), [(0.02, 0.0), (-0.05, 0.0), (0.1, 2e-3), (0.0, 2e-3)])
@@ -168,8 +153,8 @@ def test_seal_width_within_the_scatter():
     for one in PROFILES.values():
         points = points_of(one, 240)
         found, _ = profile_of(points + scatter * off[: len(points)], scatter)
-        true = float(geometry(one).seal_width)
-        assert float(geometry(found).seal_width) == pytest.approx(true, rel=0.05)
+        true = float(measure(one).seal_width)
+        assert float(measure(found).seal_width) == pytest.approx(true, rel=0.05)
 
 
 def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, monkeypatch, capsys):
@@ -191,8 +176,7 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
 
 
 def test_turned_and_clockwise_outlines_are_put_right():
-    points = points_of(CIC3, 240)
-    found, checks = profile_of(points[::-1] * np.exp(0.3j))
+    found, checks = profile_of(points_of(CIC3, 240)[::-1] * np.exp(0.3j))
     assert checks.reversed
     assert checks.turned_deg == pytest.approx(-np.degrees(0.3), abs=1e-6)
     assert conjugacy(found).least > -1e-9
@@ -286,10 +270,10 @@ def found_in(folder, points, given=None):
 
 ROTORS = {
     "EE of 2 lobes in um, clockwise, off centre": (
-        cycloids(2, 40.0)[::-1] * np.exp(0.3j) + 7 - 2j, "um", 2, 80.0, 0.0, 7 - 2j),
-    "EE of 4 lobes in m": (cycloids(4, 55.0), "m", 4, 110.0, 0.0, 0j),
+        (cycloids(2, 40.0)[::-1] * np.exp(0.3j) + 7 - 2j) / 1e-3, "um", 2, 80.0, 0.0, 7 - 2j),
+    "EE of 4 lobes in m": (cycloids(4, 55.0) / 1e3, "m", 4, 110.0, 0.0, 0j),
     "CIC cut by 0.1 mm in inch, turned": (
-        cut_cic(0.1) * np.exp(1j) + 20j, "inch", 3, 66.0, 0.1, 20j),
+        (cut_cic(0.1) * np.exp(1j) + 20j) / 25.4, "inch", 3, 66.0, 0.1, 20j),
 }  # fmt: skip
 
 
@@ -299,7 +283,7 @@ ROTORS = {
 def test_unit_axis_lobes_distance_and_inset_are_found(name, tmp_path, monkeypatch):
     monkeypatch.setattr(*POSES)
     points, unit, lobes, distance, inset, axis = ROTORS[name]
-    rotor = found_in(tmp_path, points / LENGTHS[unit])
+    rotor = found_in(tmp_path, points)
     assert rotor.lobes == lobes
     assert rotor.radius == pytest.approx(distance / 2, abs=2e-3)
     assert conjugacy(rotor.outline).inset * 1e3 == pytest.approx(inset, abs=1e-3)

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import random
 import re
-import signal
 
 import ezdxf
 import numpy as np
@@ -24,8 +23,9 @@ ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
 def drawn(path, draw, version="R2010", units=units.MM, fmt="asc", **how):
-    file = outlines.drawing(lambda document: draw(document.modelspace()), version, units, fmt)
-    path.write_bytes(file)
+    path.write_bytes(
+        outlines.drawing(lambda document: draw(document.modelspace()), version, units, fmt)
+    )
     return read(path, **how)
 
 
@@ -38,8 +38,8 @@ def lines(space, z, order=None):
         line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
 
 
-def polyline(z):
-    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True)
+def polyline(z, kind="add_lwpolyline"):
+    return lambda space: getattr(space, kind)([(p.real, p.imag) for p in z], close=True)
 
 
 def fault(path, data):
@@ -136,13 +136,9 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "device.csv").symlink_to("/dev/zero")
-    signal.alarm(30)
-    try:
-        for name in ("pipe", "folder", "device"):
-            message = refusal(read, tmp_path / f"{name}.csv")
-            assert re.search(f"{name}.csv': is a {name}; give .* an outline", message)
-    finally:
-        signal.alarm(0)
+    for name in ("pipe", "folder", "device"):
+        message = refusal(read, tmp_path / f"{name}.csv")
+        assert re.search(f"{name}.csv': is a {name}; give .* an outline", message)
     assert "can be read" in refusal(read, tmp_path / "a\0b.csv")
     (tmp_path / "large.dxf").touch()
     os.truncate(tmp_path / "large.dxf", 10**12)
@@ -150,9 +146,10 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 
 
 def spline(**changes):
-    """Return a function that draws a valid spline, but for `changes`."""
-    points = [(0, 0), (1, 2), (3, 1), (4, 0)]
-    valid = {"control_points": points, "knots": [0.0] * 4 + [1.0] * 4}
+    valid = {
+        "control_points": [(0, 0), (1, 2), (3, 1), (4, 0)],
+        "knots": [0.0] * 4 + [1.0] * 4,
+    }
 
     def draw(space):
         added = space.add_spline(degree=3)
@@ -207,31 +204,28 @@ def test_senseless_entities(tmp_path, name):
     assert re.search(message, refusal(drawn, tmp_path / "drawing.dxf", draw))
 
 
-@pytest.fixture
-def whole():
-    draw = polyline(ROTOR)
-    return outlines.drawing(lambda document: draw(document.modelspace()), "R2010").decode()
+WHOLE = outlines.drawing(lambda document: polyline(ROTOR)(document.modelspace()), "R2010").decode()
 
 
-def test_damaged_drawings_are_not_read_as_others(whole, tmp_path, capfd):
+def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
     """A decimal comma, an unknown unit or a truncated file is rejected; the library would accept
     it."""
     code = "$INSUNITS\n 70\n"
     units = "$INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but is"
     for data, message in (
-        (whole.replace("48.0", "48,0"), "a number of LWPOLYLINE must be"),
-        (whole[: whole.rindex("ENDSEC")], "end with the mark EOF"),
+        (WHOLE.replace("48.0", "48,0"), "a number of LWPOLYLINE must be"),
+        (WHOLE[: WHOLE.rindex("ENDSEC")], "end with the mark EOF"),
         ("x,y\n1,2\n", "is not a DXF file"),
         (b"AutoCAD Binary DXF\r\n\x1a\x00" + b"\xff" * 99, "is not a DXF file"),
-        *((whole.replace(f"{code}4", code + x), f"{units} {x}") for x in ("99", "-1", "17", "18")),
+        *((WHOLE.replace(f"{code}4", code + x), f"{units} {x}") for x in ("99", "-1", "17", "18")),
     ):
         assert message in fault(tmp_path / "drawing.dxf", data)
     assert capfd.readouterr().err == ""
 
 
-def test_what_the_library_says_stays_inside(whole, tmp_path, caplog):
-    odd = whole.replace(" 90\n60\n", " 90\n60.0\n")
-    assert odd != whole
+def test_what_the_library_says_stays_inside(tmp_path, caplog):
+    odd = WHOLE.replace(" 90\n60\n", " 90\n60.0\n")
+    assert odd != WHOLE
     (tmp_path / "drawing.dxf").write_text(odd)
     assert read(tmp_path / "drawing.dxf").points == pytest.approx(ROTOR)
     assert not caplog.records
@@ -252,10 +246,7 @@ def test_what_the_library_says_stays_inside(whole, tmp_path, caplog):
     ],
 )
 def test_units_and_versions_of_drawings(tmp_path, code, length, version, fmt):
-    def draw(space):
-        add = space.add_polyline2d if version == "R12" else space.add_lwpolyline
-        add([(z.real, z.imag) for z in ROTOR / length], close=True)
-
+    draw = polyline(ROTOR / length, "add_polyline2d" if version == "R12" else "add_lwpolyline")
     loop = drawn(tmp_path / "drawing.dxf", draw, version, units=code, fmt=fmt)
     assert loop.points == pytest.approx(ROTOR, abs=1e-9)
 
@@ -266,8 +257,9 @@ def test_entities_seen_from_below(tmp_path):
 
     def draw(space):
         space.add_arc((-10, 0), 5, 90, 270, dxfattribs=below)  # Right half of a circle at x = 10.
-        rows = [(-10, 5, 0), (10, 5, -1), (10, -5, 0), (-10, -5, 0)]
-        space.add_lwpolyline(rows, format="xyb", dxfattribs=below)
+        space.add_lwpolyline(
+            [(-10, 5, 0), (10, 5, -1), (10, -5, 0), (-10, -5, 0)], format="xyb", dxfattribs=below
+        )
 
     loop = drawn(tmp_path / "slot.dxf", draw)
     assert (np.min(loop.points.real), np.max(loop.points.real)) == pytest.approx(
@@ -349,9 +341,8 @@ def test_joints_of_a_clockwise_drawing():
     The rotor has joints on one flank of every lobe. Joints in the original order would lie on the
     other flank."""
     z = outlines.points("cic", 60)
-    step = len(z) // 3
     joints = np.zeros(len(z), bool)
-    joints[[k * step + j for k in range(3) for j in (37, 58, 91)]] = True
+    joints[[k * len(z) // 3 + j for k in range(3) for j in (37, 58, 91)]] = True
     z, joints = np.roll(z, -17), np.roll(joints, -17)
     found, checks = imported(Loop(z, joints), 3, 33.0, 0.0)
     turned, others = imported(Loop(z[::-1], joints[::-1]), 3, 33.0, 0.0)
@@ -362,15 +353,15 @@ def test_joints_of_a_clockwise_drawing():
             assert other == pytest.approx(one, abs=1e-12)
 
 
-@pytest.mark.parametrize("smoothing", [1e-4, 10.0, 1e4])
-def test_smoothing_that_does_not_fit_the_scatter(smoothing, capfd):
+@pytest.mark.parametrize(
+    ("smoothing", "words"), [(1e-4, "needs more than 500 knots"), (10.0, "at most 0.02 of the")]
+)
+def test_smoothing_that_does_not_fit_the_scatter(smoothing, words, capfd):
     """Too little smoothing is rejected: fitting would take minutes, and the curve would follow the
     noise."""
-    z = outlines.points("cic", 800)
+    z = outlines.points("cic", 300)
     z = z + np.random.default_rng(0).normal(0, 1e-3, (len(z), 2)) @ [1, 1j]
-    message = refusal(imported, Loop(z, np.zeros(len(z), bool)), 3, 33.0, smoothing)
-    assert re.search("outline_smoothing_mm|outline_file", message)
-    assert smoothing > 1e-3 or "needs more than 500 knots" in message
+    assert words in refusal(imported, Loop(z, np.zeros(len(z), bool)), 3, 33.0, smoothing)
     assert capfd.readouterr().err == ""
 
 
@@ -413,23 +404,17 @@ SURROUNDINGS = {
 @pytest.mark.parametrize("name", SURROUNDINGS)
 def test_the_rotor_is_told_from_what_is_drawn_around_it(tmp_path, name):
     """The larger loops have no lobes, or another place or size; the choice is reported."""
-
-    def draw(space):
-        SURROUNDINGS[name](space)
-        polyline(EE)(space)
-
-    loop = drawn(tmp_path / "drawing.dxf", draw, sought=SOUGHT)
+    path = tmp_path / "drawing.dxf"
+    loop = drawn(path, lambda s: [SURROUNDINGS[name](s), polyline(EE)(s)], sought=SOUGHT)
     assert loop.points == pytest.approx(EE, abs=1e-9)
     assert all("the 3-lobed one at (0, 0) mm is read" in note for note in loop.notes)
 
 
 def test_one_of_several_rotors_is_chosen_by_its_centre(tmp_path):
-    def pair(space):
-        for turned in (EE - 33, 33 - EE):
-            polyline(turned)(space)
-
     path = tmp_path / "pair.dxf"
-    message = refusal(drawn, path, pair, sought=SOUGHT)
+    message = refusal(
+        drawn, path, lambda s: [polyline(z)(s) for z in (EE - 33, 33 - EE)], sought=SOUGHT
+    )
     assert re.search(r"holds 2 elsewhere, at .*`profile.outline_center` = \[", message)
     for center, points in ((-33.0, EE - 33), (33.0, 33 - EE)):
         chosen = dataclasses.replace(SOUGHT, center=(center, 0.0))
@@ -449,9 +434,8 @@ def test_ends_that_miss_are_joined_or_the_key_is_named(tmp_path, gap, framed):
     """The value in the message reads the file; gaps are closed without a bend at their ends."""
 
     def draw(space):
-        shift = np.exp(1j * np.arange(12)) * gap / 2
         for k in range(12):  # A polyline per half flank, each shifted by half the gap.
-            part = np.append(EE, EE[0])[40 * k : 40 * k + 41] + shift[k]
+            part = np.append(EE, EE[0])[40 * k : 40 * k + 41] + np.exp(1j * k) * gap / 2
             space.add_lwpolyline([(z.real, z.imag) for z in part])
         if framed:
             rectangle(space, 130, 90)
@@ -506,7 +490,7 @@ def test_headers_that_state_units_or_polar_coordinates(tmp_path, header, comma):
 
 @pytest.mark.parametrize(
     ("lobes", "inset", "count"),
-    [(2, 0.3, 2000), (3, 0.2, 1000), pytest.param(4, 0.5, 4000, marks=pytest.mark.long)],
+    [(3, 0.2, 1000), pytest.param(4, 0.5, 4000, marks=pytest.mark.long)],
 )
 def test_swallow_tails_of_an_offset_are_named_and_cut_off(tmp_path, lobes, inset, count):
     """The loops are at the crossings of the pitch circle; without them, the offset is read.

@@ -19,12 +19,11 @@ from tests.mutants.mistakes import ROOT, Mistake, by_hand, chosen
 _WANTED = 0.95
 _LEFT_OUT = (".git", ".venv", "results", "dist", "build", "__pycache__", ".hypothesis")
 _RECORD = ROOT / "results" / "mutants.json"
+# Limit of processor time for a mistake's tests (s); an endless loop is noticed.
 _SECONDS = 900
-"""Limit of processor time for a mistake's tests (s); an endless loop is noticed."""
 
 
 def main() -> int:
-    """Try the mistakes, print the outcomes, return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
     parser.add_argument("--count", type=int, default=60, help="mistakes chosen (default 60)")
     parser.add_argument("--seed", type=int, default=16, help="of the choice (default 16)")

@@ -2,14 +2,12 @@
 
 import ast
 import random
-from pathlib import Path
 from typing import NamedTuple
 
 import yaml
 
 from tests.mutants.rooms import ROOMS
-
-ROOT = Path(__file__).parents[2]
+from tests.weight import ROOT
 
 
 class Mistake(NamedTuple):
@@ -27,7 +25,7 @@ class Mistake(NamedTuple):
 def by_hand() -> list[Mistake]:
     """Return the mistakes of `by_hand.yaml`. Raises `LookupError` if a text does not occur once."""
     found = []
-    for row in yaml.safe_load(Path(__file__).with_name("by_hand.yaml").read_text()):
+    for row in yaml.safe_load((ROOT / "tests" / "mutants" / "by_hand.yaml").read_text()):
         text, was, becomes = (ROOT / row["file"]).read_text(), row["was"], row["becomes"]
         if text.count(was) != 1:
             raise LookupError(f"{row['file']}: {was!r} must occur once")

@@ -76,7 +76,6 @@ class Double(Own):
 
 @functools.cache
 def operators() -> list[Operator]:
-    """Return every operator used, in a fixed order."""
     provided = OperatorProvider()
     names = sorted(filter(_USED.fullmatch, provided))
     return [*(provided[name]() for name in names), ExchangeWord(), ExchangeBranches(), Double()]

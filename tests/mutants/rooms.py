@@ -1,8 +1,7 @@
 """The numerical modules, and the tests that should notice a change in each, quickest first."""
 
-from pathlib import Path
+from tests.weight import ROOT
 
-_TESTS = Path(__file__).parents[1]
 _OF = {
     "scene/check": "new",
     "dynamics/linear": "steady",
@@ -92,7 +91,7 @@ _OF = {
 """Modules, and the WORDs in the names `test_WORD.py` of their tests."""
 
 _FILES = {
-    path.stem: path.relative_to(_TESTS.parent).as_posix() for path in _TESTS.rglob("test_*.py")
+    path.stem: path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py")
 }
 ROOMS = {
     f"rootsopt/{module}.py": tuple(_FILES[f"test_{word}"] for word in words.split())

@@ -58,25 +58,18 @@ class Made:
     @functools.cached_property
     def least(self) -> float:
         """Least feasible objective, on a grid and on finer ones around its best points."""
-
-        def best(points):
+        points, first = np.full((1, self.size), 0.5), {1: 1001, 2: 101, 3: 25}[self.size]
+        finer = ((half, 11) for half in (0.03, 0.006, 1.2e-3, 2.4e-4, 5e-5))
+        for half, count in ((0.5, first), *finer):
+            axis = np.linspace(-half, half, count)
+            steps = np.stack(np.meshgrid(*[axis] * self.size), axis=-1).reshape(-1, self.size)
+            points = np.concatenate([np.clip(one + steps, 0.0, 1.0) for one in points])
             away = np.sum((points - self.middle) ** 2, axis=1) - self.square
             points = points[(self.sign == 0) | (self.sign * away >= 0)]
             top = np.max(self.values(points)[0], axis=0)
             order = np.argsort(top)
-            return points[order[:20]], float(top[order[0]])
-
-        def grid(middle, half, count):
-            axis = np.linspace(-half, half, count)
-            steps = np.stack(np.meshgrid(*[axis] * self.size), axis=-1).reshape(-1, self.size)
-            return np.clip(middle + steps, 0.0, 1.0)
-
-        points, found = best(
-            grid(np.full(self.size, 0.5), 0.5, {1: 1001, 2: 101, 3: 25}[self.size])
-        )
-        for half in (0.03, 0.006, 1.2e-3, 2.4e-4, 5e-5):
-            points, found = best(np.concatenate([grid(one, half, 11) for one in points]))
-        return found
+            points = points[order[:20]]
+        return float(top[order[0]])
 
 
 def bounded(made: Made):
@@ -114,8 +107,7 @@ def test_a_wrong_basin_is_never_proven(seeds, sure, begun):
         bound, before, best = bounded(made)
         assert best >= made.least - 1e-4
         assert bound.lower_bound <= made.least + 1e-5, seed
-        if bound.proven:
-            assert best <= made.least + 1.2e-4 * max(1.0, abs(best)), seed
+        assert not bound.proven or best <= made.least + 1.2e-4 * max(1.0, abs(best)), seed
         proven, wrong = proven + bound.proven, wrong + (before > made.least + 1e-3)
     assert proven >= sure
     assert wrong >= begun
@@ -136,13 +128,12 @@ def proven(found, local, starts):
 
 def test_jumps_and_holes_are_counted():
     """A bound is not proven if the motion jumps, or if the best designs have no usable one."""
-    for seed, jump in ((0, 0.8), (3, 0.62)):
-        made = Made(seed, jump=jump)
-        bound, _, best = bounded(made)
-        assert bound.jumps > 0
-        assert not bound.proven or best <= made.least + 1.2e-4
-    points = np.linspace(0, 1, 1001)[:, None]
-    least = float(points[np.argmin(np.max(Made(6).values(points)[0], axis=0))][0])
+    made = Made(0, jump=0.8)
+    bound, _, best = bounded(made)
+    assert bound.jumps > 0
+    assert not bound.proven or best <= made.least + 1.2e-4
+    points = np.linspace(0, 1, 1001)
+    least = points[np.argmin(np.max(Made(6).values(points[:, None])[0], axis=0))]
     bound, _, _ = bounded(Made(6, hole=least))
     assert bound.unusable > 0
     assert not bound.proven
@@ -156,11 +147,14 @@ def test_a_limited_force_is_bounded_too():
 
     def local(point):
         cap = Group(np.zeros((1, 2)), np.array([0.16 - point @ point]), -2 * point[None])
-        one = Linearization(float(point.sum()), np.ones(2), (), np.ones(1), np.zeros((1, 2)))
-        return one._replace(caps=(cap,))
+        free = np.ones(1), np.zeros((1, 2))
+        return Linearization(float(point.sum()), np.ones(2), (), *free, (cap,))
 
-    found = bounding.Bounding(lambda point: (np.ones(1), np.zeros((1, 2))), 2, 0.4)
-    bound, _ = proven(found, local, [*np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]])])
+    bound, _ = proven(
+        bounding.Bounding(lambda point: (np.ones(1), np.zeros((1, 2))), 2, 0.4),
+        local,
+        [*np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]])],
+    )
     assert bound.lower_bound == pytest.approx(0.4, abs=1e-4)
 
 
@@ -172,10 +166,9 @@ def test_limits_that_grow_without_bound_are_no_obstacle():
     """A limit like an undercut margin: -∞ beside the designs that cannot be made, NaN beyond."""
 
     def limits(point):
-        edge, normal = point[0] - 0.3 - 0.2 * point[1], np.array([[1.0, -0.2]])
-        if edge <= 0:
-            return np.array([np.nan]), np.nan * normal
-        return np.array([1 - 0.05 / edge]), 0.05 / edge**2 * normal
+        edge = point[0] - 0.3 - 0.2 * point[1]
+        edge = edge if edge > 0 else np.nan
+        return np.array([1 - 0.05 / edge]), 0.05 / edge**2 * np.array([[1.0, -0.2]])
 
     def local(point):
         x, y = point
@@ -188,7 +181,7 @@ def test_limits_that_grow_without_bound_are_no_obstacle():
     assert proven(found, local, [start])[0].lower_bound == pytest.approx(least, abs=2e-5)
 
 
-@pytest.mark.parametrize("width", [1e-2, pytest.param(1e-3, marks=pytest.mark.long), 1e-4])
+@pytest.mark.parametrize("width", [pytest.param(1e-3, marks=pytest.mark.long), 1e-4])
 def test_a_thin_feasible_set_is_searched_too(width):
     """Designs within `width` of a curved surface, against grids; hardly a drawn one is feasible."""
 
@@ -204,8 +197,7 @@ def test_a_thin_feasible_set_is_searched_too(width):
 
     start, y = np.array([0.325, 0.5, 0.5]), np.linspace(0, 1, 100_001)
     least = np.min(0.3 * (0.2 + 0.5 * y**2 - width) + wave(y)) + np.min(wave(y))
-    found = bounding.Bounding(limits, 3, local(start).objective)
-    bound, asked = proven(found, local, [start])
+    bound, asked = proven(bounding.Bounding(limits, 3, local(start).objective), local, [start])
     assert asked[0] == 8
     assert bound.evaluations < 150
     assert bound.lower_bound == pytest.approx(least, abs=2e-5)
@@ -225,8 +217,9 @@ def test_minorants_hold_across_a_corner_that_bends_downwards():
     assert surface.jumps > 0
     lows = []
     for middle, half in rng.uniform((0.496, 1e-5), (0.504, 2e-4), (200, 2)):
-        box = bounding.Box(0.0, 0, np.array([middle]), np.array([half]), np.zeros(1), 0)
-        values, slopes = surface.within(box)
+        values, slopes = surface.within(
+            bounding.Box(0.0, 0, np.array([middle]), np.array([half]), np.zeros(1), 0)
+        )
         steps = np.linspace(-half, half, 21)
         least = np.max(values[:, None] + slopes * steps, axis=0) - 0.5 * surface.curved * steps**2
         assert np.all(least <= roof(middle + steps) + 2.5e-3)
@@ -234,36 +227,30 @@ def test_minorants_hold_across_a_corner_that_bends_downwards():
     assert np.max(lows) < 0.01
 
 
-@functools.cache
-def _real(seed: int):
-    """Return a search of two parameters with its bound, and what it found."""
-    few = ["profile.tip_arc_angle_deg=2.0", "optimizer.bounds.tip_arc_angle_deg=[1.99, 2.01]"]
-    search = Search(
-        load_config("cic_drawn", [*few, f"optimizer.seed={seed}", "optimizer.prove=true"])
-    )
-    return search, search.run()
-
-
 @pytest.mark.long
 def test_the_bound_of_a_real_problem_holds():
-    """No design of a sample, simulated from rest, is below the bound; a few touch the optimum."""
-    search, found = _real(0)
-    bound = found.optimality.bound
-    assert bound.proven
+    """No design of a sample, simulated from rest, is below the bound; a few touch the optimum.
+
+    The problem has two parameters. Searches with other seeds find the same optimum."""
+    few = "profile.tip_arc_angle_deg=2.0", "optimizer.bounds.tip_arc_angle_deg=[1.99, 2.01]"
+    optima = []
+    for seed in (4, 3, 2, 1, 0):
+        search = Search(
+            load_config("cic_drawn", (*few, f"optimizer.seed={seed}", "optimizer.prove=true"))
+        )
+        found = search.run()
+        bound = found.optimality.bound
+        assert bound.proven
+        optima.append(found.optimality.optima[0].objective)
+    assert np.ptp(optima) < 1e-6
     assert bound.record()["assumption"] == bound.assumption
     assert "unseen" not in found.optimality.record()
     rng, inside = np.random.default_rng(0), found.problem.point([*found.optimized.design.values()])
     points = [*rng.random((12, 3)), *np.clip(inside + 0.05 * rng.normal(size=(12, 3)), 0, 1)]
     values = []
     for point in map(found.problem.project, points):
-        one = search.exact(found.problem.design(point), series=False)
         assert found.problem.feasible(point)
-        values.append(found.problem.objective(one))
+        values.append(
+            found.problem.objective(search.exact(found.problem.design(point), series=False))
+        )
     assert bound.lower_bound <= min(values) < bound.lower_bound + 0.05
-
-
-@pytest.mark.long
-def test_seeds_agree():
-    found = [_real(seed)[1].optimality for seed in range(5)]
-    assert all(one.bound.proven for one in found)
-    assert np.ptp([one.optima[0].objective for one in found]) < 1e-6

@@ -1,9 +1,9 @@
 """What is known of an optimum: other optima, the number of unseen ones, vertices it may lie at."""
 
-import csv
 import json
 
 import numpy as np
+import pandas
 import pytest
 from scipy.spatial import HalfspaceIntersection
 
@@ -16,13 +16,12 @@ from rootsopt.view.names import brief
 
 
 def outcome(number, objective, *point):
-    design = {"a": point[0]}
-    return StartOutcome(number, objective, 1e-9, "converged", 10, design, np.array(point))
+    return StartOutcome(number, objective, 1e-9, "converged", 10, {}, np.array(point))
 
 
 def test_optima_are_told_apart_by_objective_and_point():
-    starts = [outcome(0, 0.9, 0.5), outcome(1, 0.8, 0.2), outcome(2, 0.8 + 1e-6, 0.2001)]
-    found = distinct([*starts, outcome(3, 0.8, 0.9)])
+    points = (0.9, 0.5), (0.8, 0.2), (0.8 + 1e-6, 0.2001), (0.8, 0.9)
+    found = distinct([outcome(number, *one) for number, one in enumerate(points)])
     assert [(one.objective, one.found) for one in found] == [(0.8, 2), (0.8, 1), (0.9, 1)]
     # Two designs that agree in one parameter only are two.
     assert len(distinct([outcome(0, 0.8, 0.2, 0.1), outcome(1, 0.8, 0.2, 0.9)])) == 2
@@ -110,10 +109,9 @@ def test_an_optimum_at_a_vertex_says_so(tmp_path, capsys, monkeypatch):
     assert len(vertex["limits"]) == 3
     assert (out / "figures" / "feasible.png").stat().st_size > 10_000
     config = load("cic_drawn", [OBJECTIVE])
-    objectives = [one["objective"] for one in vertex["others"]]
+    objectives, base = [x["objective"] for x in vertex["others"]], result["baseline"]["geometry"]
     assert objectives == sorted(objectives)
     assert len(objectives) >= 3
-    base = result["baseline"]["geometry"]
     for one in vertex["others"]:
         shape = shape_of(config.with_design([*one["design"].values()]))
         radius = float(shape.outer_radius) * 1e3
@@ -126,8 +124,6 @@ def test_an_optimum_at_a_vertex_says_so(tmp_path, capsys, monkeypatch):
         for limit in places.keys() & {*one["limits"]}:
             value, expected, accuracy = places[limit]
             assert value == pytest.approx(expected, abs=accuracy)
-    with (out / "feasible.csv").open() as file:
-        found = [row["objective"] for row in csv.DictReader(file)]
-    values = [float(one) for one in found if one not in ("", "nan")]
+    values = pandas.read_csv(out / "feasible.csv").objective.dropna()
     assert len(values) >= 4
     assert min(values) > best["geometry"]["outer_radius_mm"] / base["outer_radius_mm"] - 1e-9

@@ -12,6 +12,7 @@ import threading
 import time
 import types
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
 from rootsopt.profiles.soundness import margins
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.result import Seed
 from rootsopt.runtime.threads import until_stopped
@@ -76,74 +77,65 @@ def problem_of(*overrides):
     return Problem.of(settings, Scene.from_config(settings), baseline(settings))
 
 
-@pytest.fixture(scope="module")
-def problem():
-    return problem_of()
+@jax.jit
+def sizes(scene, design):
+    """Return longest involute (mm), outer radius (mm) and reach of the normals (m) of a design."""
+    profile = scene.profile(design)
+    return (
+        1e3 * profile.longest_involute,
+        1e3 * geometry(profile).outer_radius,
+        margins(profile).reach,
+    )
 
 
 def test_bounds_of_the_involute_replace_its_default_floor():
-    """By default, the shortest involute is a tenth of the longest. A bound may be below this."""
-    point = jnp.array([0.5, 0.0, 0.5])
+    """By default, the shortest involute is a tenth of the longest. A bound may be below this.
+
+    A bound above the longest involute is a constraint."""
     for overrides, share, least in (([], 0.1, 0.0), ([f"{INVOLUTE}=[0.3, 30]"], 0.0, 0.3)):
         space = problem_of(*overrides).space
-        design = space.design(point)
-        longest = 1e3 * float(space.scene.profile(design).longest_involute)
+        design = space.design(jnp.array([0.5, 0.0, 0.5]))
+        longest, *_ = map(float, sizes(space.scene, design))
         assert longest > 5
         assert float(design[1]) == pytest.approx(max(share * longest, least), rel=1e-12)
     space = problem_of(f"{INVOLUTE}=[0.001, 30]", f"{ANGLE}=[14, 45]").space
     for angle, tip in itertools.product((0.0, 0.1, 1.0), (0.0, 1.0)):
         design = space.design(jnp.array([angle, 0.0, tip]))
         # With a shorter one, normals of the tip arc would miss the pitch circle.
-        assert float(margins(space.scene.profile(design)).reach) >= -1e-9
-
-
-def test_bound_above_the_longest_involute_is_a_constraint():
+        assert float(sizes(space.scene, design)[2]) >= -1e-9
     problem = problem_of(f"{INVOLUTE}=[11, 30]")
-    place = [one.name for one in problem.space.constraints].index("greatest involute length")
-    lengths = []
-    for point in sobol(16, 5):
-        slack = problem.look(point)[2][place]
-        longest = 1e3 * float(problem.space.scene.profile(problem.design(point)).longest_involute)
-        assert slack == pytest.approx(0.999 * longest - 11, abs=1e-9)
-        moved = problem.project(point)
-        if problem.feasible(moved):
-            lengths.append(float(problem.design(moved)[1]))
-    assert min(lengths) >= 11 - 1e-5
+    moved = [one for one in map(problem.project, sobol(16, 5)) if problem.feasible(one)]
+    assert min(float(problem.design(one)[1]) for one in moved) >= 11 - 1e-5
 
 
-def test_projection_makes_feasible_and_keeps_feasible_points(problem):
-    inside = next(p for p in sobol(256, 4) if problem.feasible(p))
-    for one in (inside, *map(problem.project, sobol(32, 3))):
+def test_projection_makes_feasible_and_keeps_feasible_points():
+    problem = problem_of()
+    for one in map(problem.project, sobol(32, 3)):
         assert problem.feasible(one)
         assert np.all((one >= 0) & (one <= 1))
         np.testing.assert_array_equal(problem.project(one), one)
 
 
-def test_rotor_stays_in_its_housing(problem):
+def test_rotor_stays_in_its_housing():
     """Lower and upper limit of the outer radius apply on their own sides, and are reported so."""
     limits = "constraints.outer_radius_min_mm=44.2", "constraints.outer_radius_max_mm=44.5"
     settings = config(*limits, "constraints.area_efficiency_min=0.4")
-    model, start = Scene.from_config(settings), baseline(settings)
-    housed = Problem.of(settings, model, _with_radius(start, 44.3))
-    free = [float(_outer(model, problem.design(p))) * 1e3 for p in sobol(32, 3)]
+    scene, start = Scene.from_config(settings), baseline(settings)
+    housed, sample = Problem.of(settings, scene, _with_radius(start, 44.3)), sobol(32, 3)
+    free = [float(sizes(scene, housed.design(one))[1]) for one in sample]
     assert min(free) < 44.2 < 44.5 < max(free)
-    for found in map(housed.project, sobol(32, 3)):
+    for found in map(housed.project, sample):
         assert housed.feasible(found)
-        assert 44.2 - 2e-6 < float(_outer(model, housed.design(found))) * 1e3 < 44.5 + 2e-6
+        assert 44.2 - 2e-6 < float(sizes(scene, housed.design(found))[1]) < 44.5 + 2e-6
     for outer, satisfied in ((44.8, {">=": True, "<=": False}), (44.0, {">=": False, "<=": True})):
         rows = constraint_rows(housed, _with_radius(start, outer))
         rows = [row for row in rows if row["name"] == "outer radius"]
         assert {row["sense"]: row["satisfied"] for row in rows} == satisfied
 
 
-@jax.jit
-def _outer(model, design):
-    return geometry(model.profile(design)).outer_radius
-
-
 def _with_radius(one, outer):
-    sizes = {"outer_radius_mm": outer, "undercut_margin_mm": 5.0, "seal_width_mm": 5.0}
-    return dataclasses.replace(one, geometry=one.geometry | sizes)
+    own = {"outer_radius_mm": outer, "undercut_margin_mm": 5.0, "seal_width_mm": 5.0}
+    return dataclasses.replace(one, geometry=one.geometry | own)
 
 
 def test_contradicting_constraints_are_explained():
@@ -190,17 +182,17 @@ SMALL = (
 )
 
 
+def stopping(after, *overrides):
+    """Return a search that is asked to stop after a number of evaluations."""
+    stop = threading.Event()
+    return Search(config(*overrides), lambda done, *_: stop.set() if done == after else None, stop)
+
+
 def test_a_stopped_search_without_time_to_verify():
     """The best trial itself is returned, and the result says that it was not verified."""
-    stop = threading.Event()
-
-    def progress(done, expected, best):
-        if done == 8:
-            stop.set()
-
-    search = Search(config(*SMALL), progress, stop)
-    search.exact = _Slow.of(search.config)
-    assert until_stopped(search.run, stop, 0.0) is None
+    search = stopping(8, *SMALL)
+    search._verification = lambda: time.sleep(600)
+    assert until_stopped(search.run, search.stop, 0.0) is None
     result = search.so_far()
     assert (result.interrupted, result.verification["holds_up"]) == (True, None)
     trials = [row["objective"] for row in result.history if row["feasible"]]
@@ -208,37 +200,21 @@ def test_a_stopped_search_without_time_to_verify():
     assert all(row["satisfied"] for row in result.constraints)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Slow(Evaluator):
-    """An evaluator that takes ten minutes to verify a design."""
-
-    def __call__(self, design=None, start=None, series=True):
-        if self.references and not self.survey:
-            time.sleep(600)
-        return super().__call__(design, start, series)
-
-
 def test_a_search_stopped_before_it_found_anything():
     """The search stops during the first screened design, and before the baseline is simulated."""
-    stop = threading.Event()
-    search = Search(config(*SMALL), None, stop)
+    search = Search(config(*SMALL))
     assert search.so_far() is None
-    search._side_by_side = lambda *_: stop.set() or []
+    search._side_by_side = lambda *_: search.stop.set() or []
     result = search.run()
     assert (result.interrupted, result.baseline.usable) == (True, True)
     assert (result.optimized, result.history) == (None, [])
 
 
 def test_a_search_stopped_while_it_screens_says_why_it_ended():
-    stop = threading.Event()
-    radius = "objective={mean_weight: 0, peak_weight: 0, terms: {outer_radius_mm: 1}}"
-    settings = config("optimizer.screening=32", "optimizer.starts=1", radius)
-
-    def progress(done, expected, best):
-        if done == 30:
-            stop.set()
-
-    result = Search(settings, progress, stop).run()
+    result = stopping(
+        30, "optimizer.screening=32", "optimizer.starts=1",
+        "objective={mean_weight: 0, peak_weight: 0, terms: {outer_radius_mm: 1}}",
+    ).run()  # fmt: skip
     assert (result.interrupted, result.improvement["objective"] > 0) == (True, True)
     optimality = result.optimality.record()
     assert (optimality["reason"], optimality["starts"]) == ("interrupted", [])
@@ -304,10 +280,9 @@ door.leave(command.main())
     ],
 )
 def test_signals_to_the_command(tmp_path, after, number):
-    path = tmp_path / "scene.yaml"
-    path.write_text(SCENE)
-    overrides = [f"--set={text}" for text in SMALL]
-    arguments = [str(path), "-o", str(tmp_path / "run"), *overrides, "--no-figures"]
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    arguments = [str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "run"), "--no-figures"]
+    arguments += [f"--set={text}" for text in SMALL]
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED, str(after), number, *arguments],
         cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False,
@@ -326,8 +301,12 @@ def test_signals_to_the_command(tmp_path, after, number):
         assert result["optimized"]["status"] == "periodic"
         assert result["verification"]["holds_up"]
         assert result["improvement"]["objective"] > 0
-        names = {"history.csv", "optimized.yaml", "profile_optimized.csv", "response_optimized.csv"}
-        assert names <= written
+        assert {
+            "history.csv",
+            "optimized.yaml",
+            "profile_optimized.csv",
+            "response_optimized.csv",
+        } <= written
     # If there are designs to continue with, the checkpoint is kept.
     kept = [".run.checkpoint"] if after else []
     assert sorted(os.listdir(tmp_path)) == [*kept, "run", "scene.yaml"]
@@ -364,16 +343,11 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
         checkpoint.add([((0, 0), ([0.0], evaluation(0.1)))])
         return types.SimpleNamespace(run=lambda: None, so_far=lambda: None)
 
-    def given_up(self):
-        raise InputError("no space")
-
-    put = RunFolder.put_in_place
     monkeypatch.setattr(work, "search_of", search_of)
-    monkeypatch.setattr(RunFolder, "put_in_place", given_up)
     arguments = ["configs/cic_drawn.yaml", "-o", str(tmp_path / "run")]
-    assert command.main(arguments) == 2
+    with mock.patch.object(RunFolder, "put_in_place", side_effect=InputError("no space")):
+        assert command.main(arguments) == 2
     assert (older.read_text(), kept.exists()) == ("of an earlier run", True)
-    monkeypatch.setattr(RunFolder, "put_in_place", put)
     command.main([*arguments, "--resume"])
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -392,8 +366,7 @@ def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
     assert b"from_neighbour" in path.read_bytes()
     full.close()
     data = path.read_bytes()
-    head = data.index(b"\n") + 1
-    rng = np.random.default_rng(0)
+    head, rng = data.index(b"\n") + 1, np.random.default_rng(0)
     cut = data[: rng.integers(head + (len(data) - head) // 2, len(data))]
     flipped = bytearray(data)
     flipped[rng.integers(head)] ^= 1

@@ -1,7 +1,6 @@
 """Tests of the search on made-up objectives, with and without noise, without simulations."""
 
 import dataclasses
-import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -17,8 +16,6 @@ from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search
 from rootsopt.response.ensemble import SIGNIFICANT
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.journal import Checkpoint
-from rootsopt.response.reducers import HERE
 from rootsopt.response.result import ERRORS
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
@@ -27,22 +24,25 @@ from tests.standins import evaluation_of
 
 
 def trial_of(point, objective, feasible=True) -> Trial:
-    evaluation = evaluation_of(objective, design=point)
-    return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
+    return Trial(
+        np.asarray(point, float), 0, 0, evaluation_of(objective, design=point), objective, feasible
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class Knowing(Evaluator):
     """An evaluator that knows the objective of each point, and at tighter tolerances a `tight`
-    one."""
+    one. It notes where the motions begin that it is `asked` for."""
 
     truth: Callable = lambda point: 1.0
     tight: Callable = lambda point: 1.0
+    asked: list = dataclasses.field(default_factory=list)
 
     def __call__(self, design=None, start=None, series=True):
+        self.asked.append(start)
         found = self.truth(tuple(design))
         status = Status.PERIODIC if np.isfinite(found) else Status.INACCURATE
-        return evaluation_of(found, status, design)
+        return evaluation_of(found, status, design, start=np.asarray(design))
 
     def at_tolerance(self, rtol):
         return dataclasses.replace(self, truth=self.tight)
@@ -52,18 +52,10 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     """Return a search over points of the unit box whose verification finds the `truth`.
 
     `tight`: what it finds at a tighter tolerance, by default the same."""
-    search = object.__new__(Search)
-    search.stop, search._refuted, search._trials = threading.Event(), [], []
-    search._descents, search.checkpoint = {}, Checkpoint({}, None)
-    search.noisy, search.runs = True, HERE
     config = load("configs/cic_drawn.yaml")
-    given = {"screening": 0, "starts": 2} | settings
-    search.settings = config.optimizer.model_copy(update=given)
-    search.config = config.model_copy(update={"optimizer": search.settings})
-    search.stage = Stage()
-    search._lock = threading.Lock()
-    search._bar = search._best = 1.0
-    search.expected, search.progress = 0, lambda *numbers: None
+    given = config.optimizer.model_copy(update={"screening": 0, "starts": 2} | settings)
+    search = Search(config.model_copy(update={"optimizer": given}))
+    search.noisy = True
     search.problem = object.__new__(Problem)
     vars(search.problem).update(
         design=lambda point: point,
@@ -73,9 +65,9 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
         feasible=lambda point: True,
         excess=lambda evaluation: 0.0,
     )
-    known = Knowing.of(search.config)
-    search.exact = dataclasses.replace(known, truth=truth, tight=tight or truth)
-    search.sharp = search.exact
+    search.exact = search.sharp = dataclasses.replace(
+        Knowing.of(search.config), truth=truth, tight=tight or truth
+    )
     return search
 
 
@@ -120,14 +112,16 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
     assert found.design == {"x0": 0.5, "x1": 0.5}
     (rejected,) = record["rejected"]
     assert (rejected["verified_objective"], rejected["holds_up"]) == (0.95, False)
-    best = [row["best_objective"] for row in history_of(trials)]
-    np.testing.assert_array_equal(best, [0.65, 0.65, 0.65, 0.6, 0.51, 0.5])
-    starts = apart(ranked(trials), Stage.apart, 9)
-    np.testing.assert_array_equal(starts, [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]])
-    only_infeasible = trial_of([0.9, 0.9], 0.3, feasible=False)
-    assert search._verification().confirmed([only_infeasible])[0] is None
-    assert np.isnan(history_of([only_infeasible])[0]["best_objective"])
-    assert ranked([only_infeasible]) == []
+    np.testing.assert_array_equal(
+        [row["best_objective"] for row in history_of(trials)], [0.65, 0.65, 0.65, 0.6, 0.51, 0.5]
+    )
+    np.testing.assert_array_equal(
+        apart(ranked(trials), Stage.apart, 9), [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]]
+    )
+    infeasible = trials[1:2]
+    assert search._verification().confirmed(infeasible)[0] is None
+    assert np.isnan(history_of(infeasible)[0]["best_objective"])
+    assert ranked(infeasible) == []
 
 
 SPECK = (0.3, 0.7)
@@ -170,8 +164,10 @@ def test_starts_lie_apart_in_the_part_of_the_bounds_that_limits_leave(size):
         (4, trials, [0, 2, 3]),
         (0, [], [0, 2, 3] if size == 1 else [0]),
     ):
-        found = searching(screening=screening, starts=3)._starts(points, known)
-        np.testing.assert_array_equal(found, np.array(points)[places])
+        np.testing.assert_array_equal(
+            searching(screening=screening, starts=3)._starts(points, known),
+            np.array(points)[places],
+        )
 
 
 @pytest.mark.parametrize("hole", [0.0, 1e-6, 5e-4, 1.0])
@@ -194,39 +190,26 @@ def test_a_local_search_begins_beside_a_start_without_a_usable_motion(hole):
     assert (search._descents[0].local is None) == (hole == 1)
 
 
-@dataclasses.dataclass(frozen=True)
-class Told(Evaluator):
-    """An evaluator of a bowl about 0.6 where the second motion that is asked for is lost."""
-
-    asked: list = dataclasses.field(default_factory=list)
-
-    def __call__(self, design=None, start=None, series=True):
-        self.asked.append(start)
-        status = Status.NOT_SETTLED if len(self.asked) == 2 else Status.PERIODIC
-        return evaluation_of(1.0, status, design, start=np.asarray(design))
-
-
 def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkeypatch):
-    """Other steps are those of the update rule, each from the orbit of the previous trial."""
+    """Other steps are those of the update rule, each from the orbit of the previous trial. On the
+    bowl about 0.6, the second motion that is asked for is lost."""
     rates = optax.cosine_decay_schedule(0.2, 6, 0.05)
     monkeypatch.setattr(noise, "_rule", lambda iterations: optax.sgd(rates))
-    search = searching(iterations=6)
+    search = searching(lambda point: np.nan if len(starts) == 2 else 1.0, iterations=6)
     monkeypatch.setattr(noise, "descent", lambda problem, point, slope: slope)
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
-    search.fast = evaluator = Told.of(load("configs/cic_drawn.yaml"))
-    trials = search._descend(4, np.array([0.2, 0.3]))
+    search.fast = search.exact
+    first, starts = np.array([0.2, 0.3]), search.exact.asked
+    trials = search._descend(4, first)
     points = np.array([trial.point for trial in trials])
-    # Steps of gradient descent at a rate that falls along a cosine to a twentieth.
-    rates = [0.2 * (0.05 + 0.95 * (1 + np.cos(np.pi * k / 6)) / 2) for k in range(6)]
-    first = np.array([0.2, 0.3])
-    expected = [first, first - rates[0] * 2 * (first - 0.6), first - rates[0] * (first - 0.6)]
-    for rate in rates[1:5]:
-        expected.append(expected[-1] - rate * 2 * (expected[-1] - 0.6))
-    np.testing.assert_allclose(points, expected, rtol=1e-6)
-    starts = evaluator.asked
+    # Steps of gradient descent at a rate that falls along a cosine to a twentieth: each multiplies
+    # the distance from the optimum.
+    rates = 0.2 * (0.05 + 0.95 * (1 + np.cos(np.pi * np.arange(6) / 6)) / 2)
+    half = 1 - rates[0]
+    shares = np.array([1, 1 - 2 * rates[0], half, *half * np.cumprod(1 - 2 * rates[1:5])])
+    np.testing.assert_allclose(points, 0.6 + shares[:, None] * (first - 0.6), rtol=1e-6)
     assert [k for k, start in enumerate(starts) if start is None] == [0, 2]
-    for k in (1, 3, 4, 5, 6):
-        np.testing.assert_array_equal(starts[k], points[k - 1])
+    np.testing.assert_array_equal([starts[k] for k in (1, 3, 4, 5, 6)], points[[0, 2, 3, 4, 5]])
     assert [(trial.iteration, trial.start) for trial in trials] == [(k, 4) for k in range(7)]
 
 
@@ -240,7 +223,7 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
     vars(problem)["look"] = lambda point: (
         point, np.eye(2), np.array([normal @ point - 1]), normal[None]
     )  # fmt: skip
-    cases = [
+    for point, slope, expected in [
         ([0.7, 0.8], [1.0, -2.0], [1.0, -2.0]),
         ([0.7, 1.0], [1.0, -2.0], [1.0, 0.0]),
         ([0.7, 1.0], [1.0, 2.0], [1.0, 2.0]),
@@ -249,8 +232,7 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
         ([0.6, 0.4], [3.0, 1.0], [1.0, -1.0]),
         ([0.6, 0.4], [-3.0, 1.0], [-3.0, 1.0]),
         ([1.0, 0.0], [1.0, 3.0], [0.0, 0.0]),
-    ]
-    for point, slope, expected in cases:
+    ]:
         found = noise.descent(problem, np.array(point), np.array(slope))
         np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=str(point))
 

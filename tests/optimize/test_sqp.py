@@ -9,17 +9,18 @@ from rootsopt.optimize.sqp import Stops, descend
 
 def group(values, slopes):
     """Return a group of branches of one kind, distinguished by evenly spaced phases."""
-    count = len(values)
-    tags = np.stack([np.zeros(count), np.arange(count) / count], axis=1)
-    return Group(tags, np.asarray(values, float), np.asarray(slopes, float))
+    return Group(
+        np.array([[0.0, place / len(values)] for place in range(len(values))]),
+        np.asarray(values, float),
+        np.asarray(slopes, float),
+    )
 
 
-def smooth(x, limit=0.5):
-    """Return the problem (x - 0.9)² + 2 (y - 0.8)² with x + y ≤ 2 `limit`."""
-    bend = np.array([1.0, 2.0])
-    away = x - np.array([0.9, 0.8])
-    slack = np.array([2 * limit - x.sum()])
-    return Linearization(bend @ away**2, 2 * bend * away, (), slack, -np.ones((1, 2)))
+def smooth(x):
+    """Return the problem (x - 0.9)² + 2 (y - 0.8)² with x + y ≤ 1."""
+    bend, away = np.array([1.0, 2.0]), x - np.array([0.9, 0.8])
+    slack, normals = np.array([1 - x.sum()]), -np.ones((1, 2))
+    return Linearization(bend @ away**2, 2 * bend * away, (), slack, normals)
 
 
 def corner(x, lift=0.0):
@@ -27,8 +28,9 @@ def corner(x, lift=0.0):
     bends = np.array([[1.0, 1.0], [1.0, 2.0]])
     away = x - np.array([[0.2, 0.3], [0.8, 0.5]])
     values = np.sum(bends * away**2, axis=1) + np.array([lift, 0.0])
-    both = group(values, 2 * bends * away)
-    return Linearization(0.0, np.zeros(2), (both,), np.zeros(0), np.zeros((0, 2)))
+    return Linearization(
+        0.0, np.zeros(2), (group(values, 2 * bends * away),), np.zeros(0), np.zeros((0, 2))
+    )
 
 
 def test_multiplier_of_a_constraint_is_the_price_of_its_limit():
@@ -37,12 +39,6 @@ def test_multiplier_of_a_constraint_is_the_price_of_its_limit():
     assert found.reason == "converged"
     assert found.certificate.multipliers == pytest.approx([14 / 15], abs=1e-6)
     np.testing.assert_allclose(found.point, [0.9 - 7 / 15, 0.8 - 7 / 30], atol=1e-6)
-    # The same by solving again with the limit moved.
-    up, down = (
-        descend(lambda x, s=s: smooth(x, 0.5 + s / 2), np.array([0.1, 0.1])).local.objective
-        for s in (1e-3, -1e-3)
-    )
-    assert (down - up) / 2e-3 == pytest.approx(14 / 15, rel=1e-5)
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.9], [0.9, 0.1], [0.5, 0.5], [0.0, 0.0]])
@@ -138,36 +134,26 @@ def test_residual_counts_what_a_step_onto_the_limit_would_gain(kind):
     assert away == pytest.approx(2, rel=1e-9)
 
 
-def curved(seed, count=6, branches=3):
-    """Return a function of a point and of an order of the branches, and the Hessians.
-
-    The function evaluates convex quadratic functions of `count` variables: one smooth part,
-    branches, and two constraints."""
+@pytest.mark.parametrize("seed", range(3))
+def test_models_of_quadratic_functions_are_exact(seed):
+    """The functions of six variables are one smooth part, three branches, and two constraints. The
+    models are exact in whatever order the branches are listed at each point."""
     rng = np.random.default_rng(seed)
-    roots = rng.normal(size=(branches + 3, count, count)) * np.sqrt(3.0 / count)
+    roots = rng.normal(size=(6, 6, 6)) * np.sqrt(0.5)
     hessians = roots @ np.swapaxes(roots, 1, 2)
     hessians[-2:] *= -1
-    centers, slopes = rng.uniform(0.3, 0.7, (2, branches + 3, count))
-    lift = np.append(np.zeros(branches + 1), [1.2, 1.2])
+    centers, slopes = rng.uniform(0.3, 0.7, (2, 6, 6))
+    lift = np.array([0.0, 0.0, 0.0, 0.0, 1.2, 1.2])
 
-    def look(x, order=None):
+    def look(x, order=(0, 1, 2)):
         away = x - centers
         bent = np.einsum("kij,kj->ki", hessians, away)
         values = np.einsum("ki,ki->k", slopes + bent / 2, away) + lift
-        rows = slopes + bent
-        order = np.arange(branches) if order is None else order
-        tags = np.stack([np.zeros(branches), 0.1 + 0.3 * np.arange(branches)], axis=1)[order]
-        maxima = Group(tags, values[1 : branches + 1][order], rows[1 : branches + 1][order])
-        last = slice(branches + 1, None)
-        return Linearization(values[0], rows[0], (maxima,), values[last], rows[last])
+        rows, order = slopes + bent, np.array(order)
+        tags = np.stack([np.zeros(3), 0.1 + 0.3 * order], axis=1)
+        maxima = Group(tags, values[1 + order], rows[1 + order])
+        return Linearization(values[0], rows[0], (maxima,), values[4:], rows[4:])
 
-    return look, hessians
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_models_of_quadratic_functions_are_exact(seed):
-    """The models are exact in whatever order the branches are listed at each point."""
-    look, hessians = curved(seed)
     rng = np.random.default_rng(seed)
     point = rng.uniform(0.2, 0.8, 6)
     models = Models(point, look(point))
@@ -186,8 +172,7 @@ def valley(x):
     u, v = 2 * x[0] - 1, 2 * x[1] - 1
     value = 1 + 3 * (v - u**2) ** 2 + 3e-4 * (1 - u) ** 2
     slope = 2 * np.array([-12 * u * (v - u**2) - 6e-4 * (1 - u), 6 * (v - u**2)])
-    bound = np.array([1.2 - x[0] ** 2 - x[1] ** 2])
-    return Linearization(value, slope, (), bound, -2 * x[None])
+    return Linearization(value, slope, (), np.array([1.2 - x[0] ** 2 - x[1] ** 2]), -2 * x[None])
 
 
 def stiff(x):
@@ -266,8 +251,7 @@ def walled(x, limit=0.35, lift=0.0):
     """(x - 0.9)² + (y - 0.8)², where two branches must be at most `limit`, scaled by it."""
     away = x - np.array([0.9, 0.8])
     values = np.array([x[0] ** 2 + x[1] + lift, x[0] + x[1] ** 2 + lift])
-    slopes = np.array([[2 * x[0], 1.0], [1.0, 2 * x[1]]])
-    cap = group(values / limit - 1, slopes / limit)
+    cap = group(values / limit - 1, np.array([[2 * x[0], 1.0], [1.0, 2 * x[1]]]) / limit)
     return Linearization(away @ away, 2 * away, (), np.zeros(0), np.zeros((0, 2)), (cap,))
 
 

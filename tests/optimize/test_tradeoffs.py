@@ -70,9 +70,9 @@ def _two_wells(a, b):
 
 
 def front_of(points, second, first=lambda a, b: a + 1.0 + 0.0 * b, starts=1):
-    several = *ANGLES, f"pareto.points={points}", f"optimizer.starts={starts}"
+    counts = f"pareto.points={points}", f"optimizer.starts={starts}"
     with registered(first=made_up(first), second=made_up(second)):
-        return pareto_front(config(*several))
+        return pareto_front(config(*ANGLES, *counts))
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +82,8 @@ def front():
 
 
 def test_front_of_geometry_is_that_of_another_search(front):
-    """SciPy's COBYLA finds the same front.
-
-    For area efficiencies of the front it finds the least outer radius without gradients, from
-    starts of its own."""
+    """SciPy's COBYLA finds the same outer radius for the area efficiency of a point between the
+    ends, without gradients, from starts of its own."""
     scene = Scene.from_config(config())
     low, high = np.array([25.0, 0.1, 0.5]), np.array([45.0, 1.0, 8.0])
     compiled = jax.jit(lambda design: geometry(scene.profile(design)))
@@ -98,34 +96,35 @@ def test_front_of_geometry_is_that_of_another_search(front):
 
     assert front.status is Status.GEOMETRY_ONLY
     assert [point.standing for point in front.points] == [Standing.CERTIFIED] * 5
-    for point in front.points[1:-1:2]:
-        wanted, best = point.terms["area_efficiency"], np.inf
-        limits = [
-            lambda z, w=wanted: 100 * (float(at(*z).area_efficiency) - w),
-            lambda z: 1e3 * float(at(*z).seal_width) - 2.0,
-            lambda z: 1e3 * float(at(*z).undercut_margin),
-            *(lambda z, k=k: z[k] for k in range(3)),
-            *(lambda z, k=k: 1 - z[k] for k in range(3)),
-        ]
-        for start in ((0.5, 0.5, 0.2), (0.9, 0.2, 0.6)):
-            found = minimize(
-                lambda z: 1e3 * float(at(*z).outer_radius),
-                start,
-                method="COBYLA",
-                constraints=[{"type": "ineq", "fun": one} for one in limits],
-                options={"rhobeg": 0.2, "tol": 1e-5, "maxiter": 1000},
-            )
-            if max(-min(one(found.x) for one in limits), 0) < 1e-5:
-                best = min(best, found.fun)
-        assert point.terms["outer_radius_mm"] == pytest.approx(best, abs=1e-3)
+    terms, best = front.points[1].terms, np.inf
+    limits = [
+        lambda z: 100 * (float(at(*z).area_efficiency) - terms["area_efficiency"]),
+        lambda z: 1e3 * float(at(*z).seal_width) - 2.0,
+        lambda z: 1e3 * float(at(*z).undercut_margin),
+        *(lambda z, k=k: z[k] for k in range(3)),
+        *(lambda z, k=k: 1 - z[k] for k in range(3)),
+    ]
+    for start in ((0.5, 0.5, 0.2), (0.9, 0.2, 0.6)):
+        found = minimize(
+            lambda z: 1e3 * float(at(*z).outer_radius),
+            start,
+            method="COBYLA",
+            constraints=[{"type": "ineq", "fun": one} for one in limits],
+            options={"rhobeg": 0.2, "tol": 1e-5, "maxiter": 1000},
+        )
+        if max(-min(one(found.x) for one in limits), 0) < 1e-5:
+            best = min(best, found.fun)
+    assert terms["outer_radius_mm"] == pytest.approx(best, abs=1e-3)
 
 
 def test_floor_of_a_term_is_dropped_only_if_it_is_the_baselines(front):
     assert front.limits_dropped == ("area_efficiency",)
     least = min(point.terms["area_efficiency"] for point in front.points)
     assert least < front.baseline_terms["area_efficiency"] - 0.1
-    number = RADIUS, "constraints.area_efficiency_min=0.4"
-    for kept in (config(*number), config("pareto.terms=[mean_force_N, flow_ripple]")):
+    for kept in (
+        config(RADIUS, "constraints.area_efficiency_min=0.4"),
+        config("pareto.terms=[mean_force_N, flow_ripple]"),
+    ):
         assert freed(kept) == (kept, ())
     own = "{outer_radius_mm: {max: baseline, min: 30}, flow_ripple: {max: baseline}}"
     free, names = freed(
@@ -161,12 +160,14 @@ def test_gap_is_that_of_a_dense_grid():
     (gap,) = front.gaps
     assert (gap.kind, gap.confirmed) == ("terms", True)
     assert gap.tried >= 1
-    found = [front.points[k - 1].terms["first"] for k in (gap.first, gap.second)]
-    np.testing.assert_allclose(found, [left, right], atol=5e-3)
+    np.testing.assert_allclose(
+        [front.points[k - 1].terms["first"] for k in (gap.first, gap.second)],
+        [left, right],
+        atol=5e-3,
+    )
     assert (gap.first, gap.second) not in front.edges
     assert len(front.edges) == len(front.points) - 2
-    for point in front.points:
-        assert not left + 5e-3 < point.terms["first"] < right - 5e-3
+    assert not [one for one in front.points if left + 5e-3 < one.terms["first"] < right - 5e-3]
 
 
 def test_jump_of_the_designs_is_recognised():
@@ -194,9 +195,8 @@ def test_three_terms():
 
 
 def test_domination_by_brute_force():
-    random = np.random.default_rng(1)
     for count in (2, 3):
-        values = random.integers(0, 6, size=(60, count)) / 5.0
+        values = np.random.default_rng(1).integers(0, 6, size=(60, count)) / 5.0
         expected = [
             any(np.all(other <= one) and np.any(other < one) for other in values) for one in values
         ]
@@ -260,11 +260,12 @@ def test_refused_configs(override, words):
 
 def test_peaks_are_branches_of_one_group():
     """At a corner of the scaled maximum, two equal peaks share the weight of their term."""
-    peaks = Group(np.array([[0.0, 0.2], [0.0, 0.7]]), np.array([4.0, 4.0]), np.eye(2))
-    other = Group(np.array([[1.0, 0.0]]), np.array([3.0]), np.array([[-1.0, -1.0]]))
+    groups = (
+        Group(np.array([[0.0, 0.2], [0.0, 0.7]]), np.array([4.0, 4.0]), np.eye(2)),
+        Group(np.array([[1.0, 0.0]]), np.array([3.0]), np.array([[-1.0, -1.0]])),
+    )
     point = np.array([0.5, 0.5])
-    sample = Sample(point, evaluation_of(), (peaks, other), (True, False), np.zeros(0),
-                    np.zeros((0, 2)))  # fmt: skip
+    sample = Sample(point, evaluation_of(), groups, (True, False), np.zeros(0), np.zeros((0, 2)))
     scalar = Scalar(Scale(np.array([2.0, 1.0]), np.array([2.0, 2.0])), np.array([0.5, 0.5]), (0, 1))
     local = scalar.local(sample)
     assert scalar.value(sample.values) == pytest.approx(local.objective, abs=1e-15)
@@ -280,8 +281,7 @@ def test_rates_have_the_signs_of_the_terms_themselves():
 
     Of a and c more is better, of b less: a greater a costs more b, and less of c."""
     slopes = {("a", "max"): [0.5, -2.0], ("b", "min"): [1.0, 0.0], ("c", "max"): [0.0, 1.0]}
-    aims = [Aim(*one) for one in slopes]
-    point = np.array([0.5, 0.5])
+    aims, point = [Aim(*one) for one in slopes], np.array([0.5, 0.5])
     groups = [
         Group(np.array([[float(k), 0.0]]), np.zeros(1), aim.sign * np.array([slope]))
         for k, (aim, slope) in enumerate(zip(aims, slopes.values(), strict=True))
@@ -292,8 +292,10 @@ def test_rates_have_the_signs_of_the_terms_themselves():
     scalar = Scalar(scale, np.zeros(3), (0, 1, 2))
     node = Node(scalar, sample, certify(scalar.local(sample), point), "converged")
     study = object.__new__(Study)
-    keys = types.SimpleNamespace(design_keys=("b", "c"))
-    free = types.SimpleNamespace(space=types.SimpleNamespace(constraints=()), config=keys)
+    free = types.SimpleNamespace(
+        space=types.SimpleNamespace(constraints=()),
+        config=types.SimpleNamespace(design_keys=("b", "c")),
+    )
     vars(study).update(aims=tuple(aims), problem=free, term_values=lambda found: {})
     ((found,), dropped) = points_of(study, [node], selected([node], scale), scale)
     assert dropped == []
@@ -375,6 +377,7 @@ def test_a_point_divides_neighbours_if_it_lies_between_them():
     both = np.stack([one, other]), np.zeros((2, 3))
     (edge,) = assembly.Selection(*both, [], [-1, -1], [0, 1]).edges([])
     assert edge.distance == pytest.approx(2**0.5)
-    places = [0.5, 0.5], [0.2, 0.7], one, other, [0.001, 0.999], [1.5, -0.5], [2.0, 2.0]
-    between = [assembly.divides(edge, np.array(place), one, other) for place in places]
-    assert between == [True, True, False, False, False, False, False]
+    assert [
+        assembly.divides(edge, np.array(place), one, other)
+        for place in ([0.5, 0.5], [0.2, 0.7], one, other, [0.001, 0.999], [1.5, -0.5], [2.0, 2.0])
+    ] == [True, True, False, False, False, False, False]

@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.path import Path
 from scipy import integrate, optimize
 
 from experiments._common.polygons import pair_gap, signed_distance
 from rootsopt import InputError, Scene, load_config
 from rootsopt.measured.conjugacy import conjugacy
-from rootsopt.profiles import CIC, EE, geometry, place_pair
+from rootsopt.profiles import CIC, geometry, place_pair
 from rootsopt.profiles.epicycloid import circle_epicycloid
 from rootsopt.pump.flow import (
     critical_ratio,
@@ -28,8 +27,8 @@ from rootsopt.pump.flow import (
 from rootsopt.pump.gap import Allowances, mesh_gap, play
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
 from rootsopt.scene.reading import Gas
-from tests.conformance.families import LOBES, R, made, outline_of
-from tests.measured.test_outline import closed, cut, points_of, profile_of
+from tests.conformance.families import LOBES, R, made, measure, outline_of
+from tests.measured.test_outline import PROFILES, points_of, profile_of
 
 AIR = Gas(*map(jnp.asarray, (1e5, 293.15, 287.05, 1.4)))
 DESIGN = jnp.asarray([36.43, 9.0, 4.0])
@@ -41,21 +40,27 @@ def gaps(family, normal=0.0, center=0.0, radial=0.0):
     return gapped(made(family), Allowances(*map(jnp.asarray, (normal, center, radial))))
 
 
+def by_energy(before, throat):
+    """Density times speed in the throat of a nozzle of air, from enthalpy and isentrope."""
+    temperature = 293.15 * (throat / before) ** (0.4 / 1.4)
+    speed = np.sqrt(2 * 287.05 * 3.5 * (293.15 - temperature))
+    return throat / (287.05 * temperature) * speed
+
+
+# Flow (m³/s at 100 kPa) through 1 m² of a choked nozzle behind 300 kPa.
+FASTEST = by_energy(3e5, 3e5 * (2 / 2.4) ** 3.5) * 287.05 * 293.15 / 1e5
+
+
 def test_nozzle_of_air():
     """150 → 100 kPa at 293.15 K: 338.706 kg/(s·m²); choked below 0.52828, where the flow is the
     greatest over all pressures in the throat."""
     flux, up = functools.partial(nozzle_flux, gas=AIR), jnp.asarray(1.5e5)
     assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(338.706, abs=1e-3)
     assert float(critical_ratio(AIR.heat_ratio)) == pytest.approx(0.52828, abs=5e-6)
-
-    def by_energy(throat):
-        """Density times speed, from enthalpy and isentrope."""
-        cp = 287.05 * 1.4 / 0.4
-        temperature = 293.15 * (throat / 1.5e5) ** (0.4 / 1.4)
-        return throat / (287.05 * temperature) * np.sqrt(2 * cp * (293.15 - temperature))
-
-    assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(by_energy(1e5), rel=1e-12)
-    best = optimize.minimize_scalar(lambda p: -by_energy(p), bounds=(5e4, 1.4e5), method="bounded")
+    assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(by_energy(1.5e5, 1e5), rel=1e-12)
+    best = optimize.minimize_scalar(
+        lambda p: -by_energy(1.5e5, p), bounds=(5e4, 1.4e5), method="bounded"
+    )
     choked, slope = jax.value_and_grad(flux, 1)(up, jnp.asarray(1e3))
     assert float(choked) == pytest.approx(-best.fun, rel=1e-9)
     assert (float(slope), float(flux(up, up))) == (0, 0)
@@ -65,14 +70,13 @@ def test_laminar_gas_by_quadrature_of_its_pressure():
     """Mass flow per width through a slot, from dp/dx with the density of each place; for a small
     pressure difference it is the liquid's."""
     h, length, up, down, mu = 5e-5, 4e-3, 3e5, 1e5, 1.8e-5
-    found = float(laminar_mass_flow(*map(jnp.asarray, (h, length, up, down, mu)), AIR))
+    found = laminar_mass_flow(*map(jnp.asarray, (h, length, up, down, mu)), AIR)
     driven, _ = integrate.quad(lambda p: p / (287.05 * 293.15), down, up)
-    assert found == pytest.approx(h**3 * driven / (12 * mu * length), rel=1e-12)
+    assert float(found) == pytest.approx(h**3 * driven / (12 * mu * length), rel=1e-12)
 
 
 @pytest.mark.parametrize("family", ["ee", "cic"])
 def test_gaps_are_those_of_polygons(family):
-    """At another centre distance, and of rotors of smaller radius."""
     outline = outline_of(family) / 1e3
     size = 2e-5
     moved, smaller = gaps(family, center=size), gaps(family, radial=size)
@@ -95,19 +99,17 @@ def test_film_is_that_of_polygons(family):
     parabola of the same curvature where that is short."""
     h = 2e-5
     found = gaps(family, normal=h)
-    outline = outline_of(family) / 1e3
     # Length of a slot that passes as much as a gap h + x²/2R: h³ ∫ dx / (h + x²/2R)³.
     parabola = 3 * np.pi / 8 * np.sqrt(2 * np.asarray(found.least) / np.asarray(found.curvature))
+    np.testing.assert_allclose(np.asarray(found.length)[[20, 33]], parabola[[20, 33]], rtol=0.02)
     for k in (8, 20, 33, 44):
         beta = float(found.roll[k])
-        first, second = place_pair(outline, LOBES, 2 * R, -beta, -beta)
+        first, second = place_pair(outline_of(family) / 1e3, LOBES, 2 * R, -beta, -beta)
         distance = h + signed_distance(first[:-1], second)
         step = np.hypot(*np.diff(first, axis=0).T)
         inverse = (h / np.append(distance, distance[0])) ** 3
         film = np.sum((inverse[1:] + inverse[:-1]) / 2 * step)
         assert float(found.length[k]) == pytest.approx(film, rel=0.01)
-        if k in (20, 33):
-            assert float(found.length[k]) == pytest.approx(parabola[k], rel=0.02)
 
 
 @functools.cache
@@ -122,9 +124,8 @@ LIQUID = (
 )
 BLOWER = (*LIQUID, "pump.viscosity_mPa_s=0.0182", "pump.gas.inlet_pressure_Pa=1.0e5")
 IN_SERIES = (*BLOWER, "pump.tips_in_series=3")
+# Heat that changes no length; scenes where it does so have the same compiled program.
 COLD = (*LIQUID, "scene.heat={}")
-WARM = (*LIQUID, "scene.heat={rotor_warming_K: 10, housing_warming_K: 40}")
-"""Heat that changes nothing, and heat that changes lengths: scenes of one compiled program."""
 
 
 @eqx.filter_jit
@@ -135,30 +136,29 @@ def leaks(scene, design):
 
 def test_liquid_leaks_like_slots():
     scene = scene_of(*COLD)
-    found, shape = leaks(scene, DESIGN), jax.jit(geometry)(scene.profile(DESIGN))
+    found, shape = leaks(scene, DESIGN), measure(scene.profile(DESIGN))
     strip = 4 * float(shape.outer_radius) ** 2 / float(shape.area)
     assert float(found.ends) == pytest.approx(4 * strip * 5e-5**3 * 2e5 / (12 * 0.05), rel=1e-12)
     np.testing.assert_allclose(found.gap.least, 6e-5, rtol=1e-12)
     volume = 2 * 0.1 * (np.pi * float(shape.outer_radius) ** 2 - float(shape.area))
     assert float(1 - found.efficiency) == pytest.approx(float(found.total) / (50 * volume))
-    thicker = scene_of(*COLD, "pump.viscosity_mPa_s=100")
-    assert float(leaks(thicker, DESIGN).total) == pytest.approx(float(found.total) / 2, rel=1e-12)
+    thicker = leaks(scene_of(*COLD, "pump.viscosity_mPa_s=100"), DESIGN)
+    assert float(thicker.total) == pytest.approx(float(found.total) / 2, rel=1e-12)
 
 
 @eqx.filter_jit
 def tips(profile, height, nu):
-    """Return the length of the tip's slot, and points of the addendum at `nu`."""
-    length = tip_length(profile, geometry(profile), height)
-    return length, profile.position(profile.addendum(nu))
+    flank = profile.position(profile.addendum(nu))
+    return tip_length(profile, geometry(profile), height), flank
 
 
 def test_heat_opens_the_gaps_at_tips_and_ends():
     """The clearances are those between a housing and rotors whose lengths have grown.
 
     The housing's length is shared between two ends, the radius of its bore is not."""
-    scene = scene_of(*WARM)
+    scene = scene_of(*LIQUID, "scene.heat={rotor_warming_K: 10, housing_warming_K: 40}")
     found, cold = leaks(scene, DESIGN), leaks(scene_of(*COLD), DESIGN)
-    length, outer = 0.1, float(jax.jit(geometry)(scene.profile(DESIGN)).outer_radius)
+    length, outer = 0.1, float(measure(scene.profile(DESIGN)).outer_radius)
     housing, rotor = 1.1e-5 * 40, 1.1e-5 * 10
     end = ((1 + housing) * length + 2 * 5e-5 - (1 + rotor) * length) / 2
     assert end == pytest.approx(66.5e-6)
@@ -181,8 +181,7 @@ def test_tip_gap_by_polygon(family):
             LOBES, jnp.asarray(R), jnp.asarray(0.1389 * R), jnp.radians(5.0)
         )
     nu = np.linspace(0, float(profile.pitch_normal), 20001)
-    length, flank = tips(profile, jnp.asarray(h), jnp.asarray(nu))
-    flank = np.asarray(flank)
+    length, flank = map(np.asarray, tips(profile, jnp.asarray(h), jnp.asarray(nu)))
     gap = h + np.linalg.norm(flank[0]) - np.linalg.norm((flank[1:] + flank[:-1]) / 2, axis=1)
     film = 2 * np.sum(np.linalg.norm(np.diff(flank, axis=0), axis=1) * (h / gap) ** 3)
     assert float(length) == pytest.approx(film, rel=1e-4)
@@ -201,10 +200,8 @@ def test_overlapping_flanks_let_nothing_through():
 def test_gas_leaks_less_than_friction_or_inertia_alone():
     scene = scene_of(*IN_SERIES)
     found = leaks(scene, DESIGN)
-    flux = nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)
-    fastest = float(flux) * 287.05 * 293.15 / 1e5
-    assert 0 < float(found.mesh) <= 0.1 * 6e-5 * fastest * (1 + 1e-12)
-    assert 0 < float(found.tips) <= 2 * 0.1 * 8e-5 * fastest * (1 + 1e-12)
+    assert 0 < float(found.mesh) <= 0.1 * 6e-5 * FASTEST * (1 + 1e-12)
+    assert 0 < float(found.tips) <= 2 * 0.1 * 8e-5 * FASTEST * (1 + 1e-12)
     assert float(found.knudsen) == pytest.approx(0.0662e-6 / 5e-5, rel=0.01)
     assert 0 < float(found.efficiency) < 1
     # The least gap counts, wherever it is.
@@ -214,14 +211,12 @@ def test_gas_leaks_less_than_friction_or_inertia_alone():
 
 @eqx.filter_jit
 def mesh_slopes(scene, design):
-    """Return (mesh flow, its derivatives (d,), film lengths) of a design."""
-
     def mesh(design):
         profile = scene.profile(design)
         found = leakage(scene, scene.medium, profile, geometry(profile))
         return found.mesh, found.gap.length
 
-    (flow, length), slope = jax.value_and_grad(mesh, has_aux=True)(design)
+    (flow, length), (slope, _) = jax.jvp(mesh, (design,), (jnp.asarray([1.0, 1.0, 0.0]),))
     return flow, slope, length
 
 
@@ -229,16 +224,14 @@ def test_mesh_leakage_is_smooth_where_friction_takes_over_from_inertia():
     """It is the mean of the lesser flow over the roll, by NumPy, and its slope that of differences:
     the slope of a design that is moved by as little as a film's sampled points are apart."""
     scene = dataclasses.replace(scene_of(*IN_SERIES), clearance=jnp.asarray(3e-5))
-    rows = [mesh_slopes(scene, DESIGN + shift) for shift in np.outer(range(5), [2e-3, 2e-3, 0])]
+    rows = [mesh_slopes(scene, DESIGN + shift) for shift in np.outer(range(4), [2e-3, 2e-3, 0])]
     flow, slope, length = (np.array(x) for x in zip(*rows, strict=True))
     slow = (3e-5) ** 3 * (9e10 - 1e10) / (24 * 1.82e-5 * length[0] * 1e5)
-    fastest = float(nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR))
-    fast = 3e-5 * fastest * 287.05 * 293.15 / 1e5
+    fast = 3e-5 * FASTEST
     lesser = np.minimum(np.interp(np.linspace(-0.5, 47.5, 480_001), range(48), slow), fast)
     assert 3 < np.sum(slow < fast) < 43
     assert flow[0] == pytest.approx(0.1 * np.mean(lesser), rel=1e-6)
-    along = slope[1:-1, 0] + slope[1:-1, 1]
-    np.testing.assert_allclose((flow[2:] - flow[:-2]) / 4e-3, along, rtol=1e-4)
+    np.testing.assert_allclose((flow[2:] - flow[:-2]) / 4e-3, slope[1:-1], rtol=1e-4)
 
 
 def test_tips_in_series_share_the_pressure_ratio():
@@ -251,27 +244,24 @@ def test_tips_in_series_share_the_pressure_ratio():
         scene_of(*IN_SERIES), (jnp.asarray(up - down), jnp.asarray(height)),
     )  # fmt: skip
     rate = float(leaks(wide, DESIGN).tips) * down / (287.05 * 293.15) / (2 * 0.1 * height)
-
-    def flux(before, after):
-        temperature = 293.15 * (after / before) ** (0.4 / 1.4)
-        speed = np.sqrt(2 * 287.05 * 3.5 * (293.15 - temperature))
-        return after / (287.05 * temperature) * speed
-
-    assert rate == pytest.approx(flux(up, up ** (2 / 3) * down ** (1 / 3)), rel=1e-9)
+    assert rate == pytest.approx(by_energy(up, up ** (2 / 3) * down ** (1 / 3)), rel=1e-9)
 
     def uneven(between):
-        return np.diff([flux(a, b) for a, b in itertools.pairwise([up, *between, down])])
+        return np.diff([by_energy(a, b) for a, b in itertools.pairwise([up, *between, down])])
 
     first = optimize.fsolve(uneven, [1.2e5, 1.1e5])[0]
-    assert flux(up, first) < rate < 1.1 * flux(up, first)
+    assert by_energy(up, first) < rate < 1.1 * by_energy(up, first)
 
 
-def test_sheet_has_the_rows_of_its_inputs():
+def test_sheet_has_the_rows_of_its_inputs(monkeypatch):
+    # The play has its own tests, and takes most of the time of a sheet.
+    monkeypatch.setattr("rootsopt.pump.sheet._has_play", lambda scene: False)
     small = sheet(scene_of(), DESIGN)
     assert len(small) == 5
     # 3,000 revolutions per minute; a litre has a thousand cubic centimetres.
-    litres = small["displaced_volume_cm3"] / 1000 * 3000
-    assert small["theoretical_flow_l_min"] == pytest.approx(litres, rel=1e-12)
+    assert small["theoretical_flow_l_min"] == pytest.approx(
+        small["displaced_volume_cm3"] / 1000 * 3000, rel=1e-12
+    )
     whole = sheet(scene_of(*LIQUID), DESIGN)
     assert whole["volumetric_efficiency"] == pytest.approx(
         1
@@ -287,8 +277,7 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     assert missing({}).count("(") == 3
     whole = dict.fromkeys(KEYS, 0.5)
     assert missing(whole) == ""
-    del whole["tip_leakage_l_min"]
-    assert "`pump.tip_clearance_mm`" in missing(whole)
+    assert "`pump.tip_clearance_mm`" in missing({k: 0.5 for k in whole if "tip_leak" not in k})
     assert warnings({}) == warnings({"volumetric_efficiency": 0.9, "knudsen_number": 1e-3}) == []
     for key, value, word in (
         ("knudsen_number", 0.1, "slips"),
@@ -338,53 +327,35 @@ def test_ee_and_involute():
 
 
 @pytest.mark.parametrize(
-    "family",
+    ("family", "error"),
     [
-        "cic",
+        ("cic", 0.0),
+        ("cic", 3e-5),
         *(
-            pytest.param(one, marks=pytest.mark.long)
+            pytest.param(one, 0.0, marks=pytest.mark.long)
             for one in ("ee", "five_arcs", "ellipse", "extended_cycloid")
         ),
     ],
 )
-def test_polygons_touch_where_the_play_ends(family):
+def test_polygons_touch_where_the_play_ends(family, error):
     """The rotors' polygons, with nominal flanks, overlap there by the clearance; half the way they
-    do by less."""
-    found, outline = of(family), outline_of(family) / 1e3
+    do by less. So they do at another centre distance, where the flanks are not conjugate."""
+    found, outline = of(family, error), outline_of(family) / 1e3
     for k in (3, 41, 70):
         phi, behind, ahead = (float(x[k]) for x in (found.phi, found.behind, found.ahead))
         for end in (behind, ahead):
-            gap = pair_gap(outline, LOBES, 2 * R, phi, phi + end)
+            gap = pair_gap(outline, LOBES, 2 * R + error, phi, phi + end)
             assert gap == pytest.approx(-C, rel=2e-3)
-            assert pair_gap(outline, LOBES, 2 * R, phi, phi + end / 2) > -0.99 * C
-
-
-@pytest.mark.parametrize("error", [pytest.param(0.0, marks=pytest.mark.long), 3e-5])
-def test_rotors_intersect_beyond_their_play(error):
-    """Points of one polygon lie inside of the other just beyond the play, and none just within;
-    also at another centre distance, where the flanks are not conjugate."""
-    found = of("cic", error)
-    polygon = closed(cut(outline_of("cic")[:-1:4] @ [1e-3, 1e-3j], C / 2))
-    for k, end in itertools.product((5, 44, 83), (found.behind, found.ahead)):
-        for share, expected in ((0.97, False), (1.03, True)):
-            turned = float(found.phi[k] + share * end[k])
-            pair = place_pair(polygon, LOBES, 2 * R + error, float(found.phi[k]), turned)
-            assert intersect(*pair, 2 * R) == expected
-
-
-def intersect(first, second, distance):
-    """Whether a vertex of one of two polygons lies inside of the other."""
-    near = [z[abs(z[:, 0] - distance / 2) < 0.45 * distance / 2] for z in (first, second)]
-    return any(Path(a).contains_points(b).any() for a, b in ((first, near[1]), (second, near[0])))
+            assert pair_gap(outline, LOBES, 2 * R + error, phi, phi + end / 2) > -0.99 * C
 
 
 def test_overlap_is_negative():
     """A centre distance that is too small: tips overlap by all of it, flanks by less."""
-    found = of("cic", -2e-4)
+    found = of("ee", -2e-4)
     assert float(found.overlap) == pytest.approx(2e-4 - C, rel=2e-2)
-    lever = R * np.cos(np.radians(36.43))
-    assert -1.05 < float(found.gear_backlash) / (2 * R * 1.5e-4 / lever) < -0.5
-    assert float(of("cic").overlap) == 0
+    # The greatest lever of EE is r.
+    assert -1.05 < float(found.gear_backlash) / (2 * 1.5e-4) < -0.5
+    assert float(of("ee").overlap) == 0
 
 
 @pytest.mark.long
@@ -392,15 +363,15 @@ def test_overlap_is_negative():
 def test_play_is_continuous_in_the_overlap(family):
     """Points with 2 µm of scatter: from overlap to clearance, the backlash changes by twice the
     clearance over the cosine of the least pressure angle, and the overlap is that of the gap."""
-    profile = {"ee": EE(LOBES, R), "cic": CIC(LOBES, R, np.deg2rad(36.43), 8.5e-3, 0.07)}[family]
-    points = points_of(profile, 240)
+    points = points_of(PROFILES[family], 240)
     points = points + 2e-3 * np.random.default_rng(0).normal(size=(len(points), 2)) @ [1, 1j]
     scattered = profile_of(points, 2e-3)[0]
     # Backlash, overlap and clearance in µm, least play in mrad.
     clearance = np.array([-5.0, -0.5, 0.0, 0.5, 5.0])
     found = [played(scattered, 1e-6 * c, 2 * R, radial=0.0) for c in clearance]
-    rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
-    backlash, overlap, play = np.array(rows, float).T
+    backlash, overlap, play = np.array(
+        [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found], float
+    ).T
     least = 1e6 * conjugacy(scattered).least
     assert -4 < least < -0.5
     assert overlap == pytest.approx(np.maximum(0, -least - clearance), abs=0.2)
@@ -427,13 +398,14 @@ def test_play_is_smooth_in_the_design():
     @jax.jit
     def ends(angle):
         def at(angle):
-            poses = jnp.asarray([0.1, 0.35, 0.8])
-            found = play(CIC(LOBES, R, angle, 8.5e-3, 0.07), jnp.asarray(C), phi=poses)
+            profile, poses = CIC(LOBES, R, angle, 8.5e-3, 0.07), jnp.asarray([0.1, 0.35, 0.8])
+            found = play(profile, jnp.asarray(C), phi=poses)
             return jnp.stack([found.behind, found.ahead])
 
         return jax.jvp(at, (angle,), (jnp.ones(()),))
 
-    angles = np.deg2rad(36.4) + 2e-6 * np.arange(12)
-    values, slopes = (np.array(x) for x in zip(*map(ends, angles), strict=True))
-    differences = (values[2:] - values[:-2]) / 4e-6
-    np.testing.assert_allclose(differences, slopes[1:-1], atol=1e-4 * np.max(np.abs(slopes)))
+    found = [ends(np.deg2rad(36.4) + 2e-6 * k) for k in range(12)]
+    values, slopes = (np.array(x) for x in zip(*found, strict=True))
+    np.testing.assert_allclose(
+        (values[2:] - values[:-2]) / 4e-6, slopes[1:-1], atol=1e-4 * np.max(np.abs(slopes))
+    )

@@ -19,7 +19,7 @@ from rootsopt.pump import flow, loads
 from rootsopt.pump.loads import BearingSet, static_loads
 from rootsopt.response.terms import needs_forces, terms_of
 from rootsopt.scene.reading import GRAVITY
-from tests.conformance.families import LOBES, R, made, outline_of
+from tests.conformance.families import LOBES, R, made, measure, outline_of
 
 GAS, BEARINGS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
 
@@ -34,7 +34,6 @@ bearing_set = eqx.filter_jit(BearingSet.of)
 
 @pytest.fixture(scope="module")
 def twisted():
-    """Twisted rotors in some poses: loads, and the flanks' forces in every slice."""
     bearings = bearing_set(*scene_of(GAS, BEARINGS, "rotor.helix_deg=50", "solver.slices=4"))
     pair = bearings.pair
 
@@ -43,8 +42,10 @@ def twisted():
         motion = pair.motion(tau, state)
         return bearings.at(tau, state), pair.pushes(motion), pair.contact_at(tau, state), motion
 
-    poses = [(0.13, 0.4), (0.31, -0.9), (0.62, 1.1), (0.9, -0.6)]
-    return bearings, [at(jnp.asarray(t), jnp.asarray([x, 0.3])) for t, x in poses]
+    return bearings, [
+        at(jnp.asarray(t), jnp.asarray([x, 0.3]))
+        for t, x in ((0.13, 0.4), (0.31, -0.9), (0.62, 1.1), (0.9, -0.6))
+    ]
 
 
 def test_push_acts_on_its_line(twisted):
@@ -95,9 +96,8 @@ def test_bearings_balance_all_forces(twisted):
     slice_forces, chords = eqx.filter_jit(gas.slice_forces), eqx.filter_jit(gas.chords)
     for out, pushes, _, motion in found:
         pressed = np.asarray(slice_forces(motion.phi))
-        torque = float(loads.gear(motion.relative, motion.rate))
-        teeth = np.asarray(tooth_force(jnp.asarray(-torque), loads.radius, loads.tooth_angle))
-        teeth = np.array([-teeth, teeth])
+        torque = loads.gear(motion.relative, motion.rate)
+        teeth = np.outer([-1, 1], tooth_force(-torque, loads.radius, loads.tooth_angle))
         force = np.asarray(pushes.force).sum(1)
         flank = np.stack([-force, force], axis=1)
         total = (flank + pressed).sum(0) + teeth + [0, -float(loads.weight)]
@@ -110,25 +110,20 @@ def test_bearings_balance_all_forces(twisted):
         across = rate * float(gas.pressure_length) * np.asarray(slices.weights)[:, None] * against
         np.testing.assert_allclose(out.axial, (axial + across).sum(0), rtol=1e-9)
         # Moments about the middle: r x F, with all three components of each force.
-        moment = np.zeros((2, 3))
-        for k, z in enumerate(heights):
-            for rotor in range(2):
-                for at, push, along in (
-                    (places[k, rotor], flank[k, rotor], axial[k, rotor]),
-                    ((contact + tip)[k, rotor] / 2, pressed[k, rotor], across[k, rotor]),
-                ):
-                    moment[rotor] += np.cross([*at, z], [*push, along])
-        np.testing.assert_allclose(out.tilting, moment[:, :2], rtol=1e-9, atol=1e-12)
-        for rotor in range(2):
-            moment[rotor] += np.cross([0, 0, float(bearings.gear)], [*teeth[rotor], 0])
-            ends = np.array([1, -1]) * float(bearings.bearing)
-            carried = sum(
-                np.cross([0, 0, z], [*x, 0])
-                for z, x in zip(ends, np.asarray(out.radial)[rotor], strict=True)
+        up = np.broadcast_to(heights[:, None, None], (len(heights), 2, 1))
+        moment = sum(
+            np.cross(np.dstack([at, up]), np.dstack([push, along])).sum(0)
+            for at, push, along in (
+                (places, flank, axial), ((contact + tip) / 2, pressed, across)
             )
-            np.testing.assert_allclose(carried[:2], moment[rotor, :2], rtol=1e-9, atol=1e-12)
+        )  # fmt: skip
+        np.testing.assert_allclose(out.tilting, moment[:, :2], rtol=1e-9, atol=1e-12)
+        moment += np.cross([0, 0, float(bearings.gear)], np.pad(teeth, ((0, 0), (0, 1))))
+        ends = np.outer([1, -1], [0, 0, float(bearings.bearing)])
+        carried = np.cross(ends, np.pad(out.radial, ((0, 0), (0, 0), (0, 1)))).sum(1)
+        np.testing.assert_allclose(carried[:, :2], moment[:, :2], rtol=1e-9, atol=1e-12)
     assert (float(bearings.bearing), float(bearings.gear)) == pytest.approx((0.07, 0.1))
-    area = float(geometry(scene_of()[0].profile(jnp.asarray([36.43, 9.0, 4.0]))).area)
+    area = float(measure(scene_of()[0].profile(jnp.asarray([36.43, 9.0, 4.0]))).area)
     assert float(loads.weight) == pytest.approx(GRAVITY * 7800 * 0.1 * area)
 
 
@@ -150,13 +145,14 @@ def test_pockets_of_twisted_rotors_open_at_once():
 
 
 def test_static_loads():
-    """Gear and gas alone, from the formulas; more weight, more load."""
+    """Gear and gas alone, from the formulas. Loads along a motion need its forces."""
     scene, design = scene_of(GAS, "scene.bearings={bearing_distance_mm: 0, kind: ball}")
+    assert needs_forces(scene, *terms_of(["bearing_load_equivalent_N"]), design)
     bearings = bearing_set(scene, design)
     phi = 2 * np.pi / 3 * (np.arange(720) + 0.5) / 720
-    gas = bearings.loads.gas
-    first, second = (np.asarray(jax.jit(jax.vmap(gas.slice_forces))(phi))[:, 0] @ [1, 1j]).T
-    torque = np.asarray(jax.jit(jax.vmap(bearings.pair.load.torque2))(phi))
+    pressed = jax.jit(jax.vmap(bearings.loads.gas.slice_forces))(phi)
+    first, second = (np.asarray(pressed)[:, 0] @ [1, 1j]).T
+    torque = jax.jit(jax.vmap(bearings.pair.load.torque2))(phi)
     teeth = tooth_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))) @ np.array([1, 1j])
     # Half of the gas, and the gear 50 mm beyond a bearing of two that are 100 mm apart.
     each = [
@@ -165,20 +161,14 @@ def test_static_loads():
     ]
     equivalent, greatest = static_loads(scene, design)
     np.testing.assert_allclose(greatest, np.max(np.abs(each), axis=1), rtol=1e-9)
-    expected = np.mean(np.abs(each) ** 3, axis=1) ** (1 / 3)
-    np.testing.assert_allclose(equivalent, expected, rtol=1e-9)
-
-
-def test_term_needs_forces():
-    (term,), (scene, design) = terms_of(["bearing_load_equivalent_N"]), scene_of(BEARINGS)
-    assert needs_forces(scene, term, design)
+    np.testing.assert_allclose(equivalent**3, np.mean(np.abs(each) ** 3, axis=1), rtol=1e-9)
 
 
 # Gear and pressure on polygons
 
 
+# Pressure difference times length (N/m).
 ACROSS = 3e4 * 0.1
-"""Pressure difference times length (N/m)."""
 PHI = np.linspace(-0.9, 1.4, 23) + 0.0123
 
 
@@ -200,9 +190,8 @@ def test_pressure_on_polygons(family):
     contact, and of its moment about the axis. The torques do the work of the flow."""
     forces, moments, through = map(np.asarray, measured(made(family)))
     np.testing.assert_allclose(np.sum(moments, axis=0), ACROSS * through, rtol=1e-9)
-    outline = outline_of(family) / 1e3
-    for k in range(0, len(PHI), 5):
-        first, second = place_pair(outline, LOBES, 2 * R, PHI[k], PHI[k])
+    for k in range(0, len(PHI), 8):
+        first, second = place_pair(outline_of(family) / 1e3, LOBES, 2 * R, PHI[k], PHI[k])
         # Rotor 2 in a mirror is passed through in the same sense as rotor 1.
         for row, points in ((0, first), (1, (second * [-1, 1] + [2 * R, 0])[::-1])):
             z = points[:-1] @ [1, 1j]
@@ -227,5 +216,7 @@ def test_gear_and_equivalent_load():
     back = complex(*tooth_force(*map(jnp.asarray, (-3.3, R, np.radians(20)))))
     assert back == pytest.approx(force.conjugate())
     assert back.real > 0
-    found = loads.equivalent_load(jnp.asarray([[10.0 + 0j, 10.0j], [20.0, 0.0]]), 3.0)
-    np.testing.assert_allclose(found, [10.0, 20 * 0.5 ** (1 / 3)])
+    np.testing.assert_allclose(
+        loads.equivalent_load(jnp.asarray([[10.0 + 0j, 10.0j], [20.0, 0.0]]), 3.0),
+        [10.0, 20 * 0.5 ** (1 / 3)],
+    )

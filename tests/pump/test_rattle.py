@@ -19,6 +19,7 @@ from rootsopt.pump.rattle import SILENT, silent_limit
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import design_vector
+from tests.conformance.families import measure
 
 BOOSTER = """
 profile: {family: ee, lobes: 2, pitch_radius_mm: 62.5}
@@ -35,10 +36,10 @@ FIVE_ARCS = (
     "tip_arc_angle_deg: 3, tip_arc_radius_mm: 38, tip_arc_turn_deg: 45}"
 )
 RADIUS, SPEED, STIFFNESS, LOAD, HALF = 62.5e-3, 100 * np.pi, 1e5, 4.0, 0.05 / 125
+# Eccentricity (µm) at which a silent and a noisy motion coexist.
 ECCENTRICITY = 16.0
-"""Eccentricity (µm) at which a silent and a noisy motion coexist."""
+# ε (rad) and dε/dt (rad/s) at φ1 = 0, near the noisy motion.
 NOISY = np.array([-2.99e-4, 0.0515])
-"""ε (rad) and dε/dt (rad/s) at φ1 = 0, near the noisy motion."""
 
 
 def config_of(*changes, eccentricity=ECCENTRICITY):
@@ -52,13 +53,13 @@ def scene_of(*changes, **more):
 
 @functools.cache
 def inertia_and_damping(*changes):
-    pair = eqx.filter_jit(Scene.pair)(*scene_of(*changes))
-    return float(pair.inertia), float(pair.gear.damping)
+    scene, design = scene_of(*changes)
+    inertia = scene.inertia(jax.jit(lambda design: geometry(scene.profile(design)))(design))
+    return float(inertia), float(scene.gear_of(inertia).damping)
 
 
 @functools.cache
 def evaluations():
-    """The motions from rest and from `NOISY`."""
     evaluator = Evaluator.of(config_of())
     design = design_vector(evaluator.config)
     starts = map(evaluator.pair(design).scaled, jnp.asarray([0 * NOISY, NOISY]))
@@ -168,7 +169,7 @@ def test_limit_is_a_term():
     (term,) = terms_of([SILENT])
     scene, design = scene_of("scene.load.torque_N_m=40")
     limit, profile = silent_limit(scene, design), scene.profile(design)
-    value = term.value(scene, profile, geometry(profile), None)
+    value = eqx.filter_jit(term.value)(scene, profile, measure(profile), None)
     assert float(value) == pytest.approx(1e6 * float(limit.value))
     assert float(limit.depth) > 0
     with pytest.raises(InputError, match="needs a timing gear with errors"):
@@ -184,14 +185,13 @@ def test_measured_error(tmp_path):
 
     rows = [f"{x},0,{smooth(x * DEG):.9f}" for x in np.arange(0, 361, 7.5)]
     file.write_text("# single flank test\nrotation_deg,raw,error_um\n" + "\n".join(rows))
-    measured = f"scene.timing_gear.transmission_error_file={file}"
-    scene, _ = scene_of(measured, eccentricity="null")
-    phi = jnp.linspace(-7.0, 9.0, 333)
-    middle, wider = scene.gear.errors(phi)
-    assert np.allclose(1e6 * RADIUS * middle, smooth(np.asarray(phi)), atol=1e-4)
+    scene, _ = scene_of(f"scene.timing_gear.transmission_error_file={file}", eccentricity="null")
+    along = jax.jit(lambda phi: jax.jvp(scene.gear.errors, (phi,), (jnp.ones_like(phi),)))
+    phi = np.linspace(-7.0, 9.0, 333)
+    (middle, wider), (slope, _) = along(phi)
+    assert np.allclose(1e6 * RADIUS * middle, smooth(phi), atol=1e-4)
     assert not np.any(wider)
-    slope = jax.vmap(jax.grad(lambda x: scene.gear.errors(x)[0]))(phi)
-    wanted = -6 * np.sin(np.asarray(phi) - 1) + 6 * np.cos(3 * np.asarray(phi))
+    wanted = -6 * np.sin(phi - 1) + 6 * np.cos(3 * phi)
     assert np.allclose(1e6 * RADIUS * slope, wanted, atol=2e-3)
 
 

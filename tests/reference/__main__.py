@@ -14,23 +14,19 @@ from tests.reference.compare import ChangedError, differences, limits
 
 FILE = Path(__file__).with_name("reference.json")
 """The file of stored results."""
+# Relative changes of the speed that represent rounding.
 _NUDGES = (1e-13, -1e-13, 3e-13, -3e-13)
-"""Relative changes of the speed that represent rounding."""
 
 
 def read() -> dict[str, dict[str, Any]]:
-    """Return the stored results by name of the case."""
     return json.loads(FILE.read_text())["results"] if FILE.exists() else {}
 
 
 def write(results: dict[str, dict[str, Any]]) -> None:
     """Store results: numbers with all their digits, a line for each case."""
     head = {"call": package.CALL, "versions": package.versions()}
-    lines = [f"{json.dumps(name)}: {json.dumps(result)}" for name, result in results.items()]
-    body = ",\n".join(lines)
-    text = f'{json.dumps(head)[:-1]},\n"results": {{\n{body}\n}}}}\n'
-    json.loads(text)
-    FILE.write_text(text)
+    body = ",\n".join(f"{json.dumps(name)}: {json.dumps(one)}" for name, one in results.items())
+    FILE.write_text(f'{json.dumps(head)[:-1]},\n"results": {{\n{body}\n}}}}\n')
 
 
 def result_of(case: Case) -> dict[str, Any]:
@@ -54,7 +50,6 @@ def check(case: Case, results: dict[str, Any]) -> tuple[dict[str, float], dict[s
 
 
 def main() -> int:
-    """Store the named cases, or all without a name."""
     parser = argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases whose name begins so")
     parser.add_argument("--missing", action="store_true", help="only cases without a stored result")

@@ -19,17 +19,14 @@ class Case(NamedTuple):
     nudged: bool = True
 
 
-_TIGHT = "solver.rtol=1e-11"
-
-
 def _tight(case: Case) -> Case:
     """Return the case at a tight tolerance, unless its tolerance is its subject."""
     loose = case.name.startswith(_AS_SHIPPED) or any("rtol" in one for one in case.overrides)
-    return case if loose else case._replace(overrides=[_TIGHT, *case.overrides])
+    return case if loose else case._replace(overrides=["solver.rtol=1e-11", *case.overrides])
 
 
+# Beginnings of the names of cases that use the config's own tolerance.
 _AS_SHIPPED = ("as shipped", "inaccurate", "ensemble")
-"""Beginnings of the names of cases that use the config's own tolerance."""
 
 
 def _sections(**values: str) -> list[str]:
@@ -82,12 +79,12 @@ _FAMILIES = {
                                    "outline_smoothing_mm: 2.0e-3"),
 }  # fmt: skip
 _GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}"
+# A light load at high speed, at which the motion is sound without a timing gear.
 _BARE = [
     "scene.timing_gear=null",
     *_sections(speed="6000", load="0.1"),
     "profile.involute_length_mm=6",
 ]
-"""A light load at high speed, at which the motion is sound without a timing gear."""
 _PARTS = {
     "no gear": [],
     "gear": [_GEAR],
@@ -105,15 +102,15 @@ _PARTS = {
     "centre distance error": [_GEAR, "scene.center_distance_error_mm=0.02"],
     "supports": [_GEAR, "scene.supports={stiffness_N_per_mm: 2.0e5, damping_N_s_per_mm: 5}"],
 }
+# A stable orbit of two mesh periods, which is sensitive to small changes.
 _SHAKY = [
     *_sections(speed="1700", load="3", backlash="0.25", damping="0.3", gear="9000"),
     "profile.pressure_angle_deg=30.7",
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 ]
-"""A stable orbit of two mesh periods, which is sensitive to small changes."""
+# A backlash at which motions coexist at 6000 rpm.
 _TWO = ["scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2"]
-"""A backlash at which motions coexist at 6000 rpm."""
 _GRID = ["attractors.relatives=5", "attractors.rates=4"]
 _FEW = ["ensemble.members=4", "ensemble.settle_periods=24", "ensemble.periods=8"]
 _MEASURED = ["response.lines=[1, 2, 3.5]", "objective.peak_norm=16"]

@@ -24,8 +24,8 @@ LOOSE = 1.0
 Such a motion magnifies every difference, until it is another motion."""
 ROUNDING = 10.0
 """Allowed difference, as a multiple of the one that rounding of the speed causes."""
+# Share of the greatest number beside it below which a number is compared with that share.
 _SMALL = 1e-3
-"""Share of the greatest number beside it below which a number is compared with that share."""
 _MULTIPLIER = "floquet_multiplier"
 
 
@@ -43,8 +43,8 @@ def differences(found: dict[str, Any], kept: dict[str, Any]) -> dict[str, float]
 
     Raises `ChangedError` where status, kind of motion, period or the names of the numbers
     differ."""
-    _same("status", found["status"], kept["status"])
     here, there = found["steady_state"], kept["steady_state"]
+    _same("status", found["status"], kept["status"])
     for key in ("kind", "period"):
         _same(key, here.get(key), there.get(key))
     for key in ("design", "geometry", "response", "gradient"):
@@ -83,11 +83,8 @@ def limits(kept: dict[str, Any]) -> dict[str, float]:
 
     The effect of rounding is included."""
     rounding = kept.get("rounding", {})
-    found = {name: max(LIMITS[name], ROUNDING * rounding.get(name, 0.0)) for name in LIMITS}
-    if is_loose(kept):
-        for name in ("response", "average"):
-            found[name] = max(LOOSE, found[name])
-    return found
+    least = LIMITS | (dict.fromkeys(("response", "average"), LOOSE) if is_loose(kept) else {})
+    return {name: max(least[name], ROUNDING * rounding.get(name, 0.0)) for name in LIMITS}
 
 
 def _same(what: str, found: Any, kept: Any) -> None:

@@ -1,11 +1,15 @@
 """The one place that calls rootsopt: load a config, evaluate it, take its record."""
 
 import os
+import platform
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import rootsopt
+from rootsopt.config import load
+
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 CALL = "Evaluator.of_objective(load(config, overrides))(series=False).record()"
 """The call of each case, as stated in the reference file."""
 KEPT = ("design", "geometry", "response", "gradient", "steady_state", "status")
@@ -32,25 +36,18 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     config: name of a shipped config. overrides: HERE in them is this folder. nudge: relative change
     of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
     for a config that is refused."""
-    from rootsopt.config import load
     from rootsopt.response.evaluation import Evaluator
 
-    path = ROOT / "configs" / f"{config}.yaml"
     overrides = [one.replace("HERE/", f"{HERE}/") for one in overrides]
-    found = load(path, overrides)
+    found = load(config, overrides)
     if nudge:
         speed = found.scene.speed_rpm * (1 + nudge)
-        found = load(path, [*overrides, f"scene.speed_rpm={speed!r}"])
+        found = load(config, [*overrides, f"scene.speed_rpm={speed!r}"])
     record = Evaluator.of_objective(found)(series=False).record()
     return {key: record[key] for key in KEPT if key in record}
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages on which the numbers depend."""
-    import platform
-    from importlib import metadata
-
-    import rootsopt
-
     own = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
     return own | {name: metadata.version(name) for name in PACKAGES}

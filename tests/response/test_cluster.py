@@ -67,8 +67,8 @@ def test_a_killed_worker_loses_and_duplicates_nothing(tmp_path, monkeypatch):
 def test_a_point_that_kills_its_process_is_a_status(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
     rows = swept(tmp_path / "points", plan_of({SPEED: f"100,200,{DEADLY},300,400,500"}))
-    statuses = {number: row["status"] for number, row in rows.items()}
-    assert statuses == dict.fromkeys(range(6), "invalid") | {2: "failed"}
+    expected = dict.fromkeys(range(6), "invalid") | {2: "failed"}
+    assert {number: row["status"] for number, row in rows.items()} == expected
     assert "may need more memory" in rows[2]["message"]
 
 
@@ -190,18 +190,17 @@ def test_classes_of_a_script_travel(tmp_path):
     subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
     _, (evaluator, design, start, _) = pickle.loads(task.read_bytes())
     assert type(evaluator).answer == 42
-    assert design.tolist() == [1.0, 1.0, 1.0]
-    assert start is None
-
-
-def test_without_workers_evaluations_run_here():
-    with running() as runs:
-        assert runs is HERE
+    assert (design.tolist(), start) == ([1.0, 1.0, 1.0], None)
 
 
 def test_the_price_of_workers_is_said_before_they_start(capsys):
-    """The context is not entered, so nothing has started yet."""
-    runs_of(Namespace(workers=3, scheduler=None, imports=[], no_cache=False))
+    """Without workers, evaluations run here, and nothing is said."""
+    options = {"scheduler": None, "imports": [], "no_cache": False}
+    with runs_of(Namespace(workers=None, **options)) as runs:
+        assert runs is HERE
+    assert capsys.readouterr().err == ""
+    # The context is not entered, so nothing has started yet.
+    runs_of(Namespace(workers=3, **options))
     assert "are no faster than this process" in capsys.readouterr().err
 
 
@@ -252,39 +251,31 @@ def test_results_are_in_the_order_of_the_points(runs):
 
 @pytest.mark.parametrize("slots", [1, 3])
 def test_points_are_taken_when_they_can_begin(slots):
-    """No more are under way than can run, and an iterator that ends leaves out the rest."""
+    """No more are under way than can run, and an iterator that ends leaves out the rest.
+
+    An error is raised and ends the rest."""
     taken, running, counts = [], set(), []
 
     def work(item):
+        if item == 8:
+            raise ArithmeticError(item)
         running.add(item)
         counts.append(len(running))
         time.sleep(0.005)
         running.remove(item)
         return -item
 
-    def items():
-        for number in range(8):
+    def items(count):
+        for number in range(count):
             assert len(running) < slots
             taken.append(number)
             yield number
 
-    found = as_done(work, items(), slots)
+    found = as_done(work, items(8), slots)
     assert taken == []
     assert sorted(found) == [(k, -k) for k in range(8)]
     assert max(counts) == slots
-
-
-@pytest.mark.parametrize("slots", [1, 3])
-def test_an_error_is_raised_and_ends_the_rest(slots):
-    begun = []
-
-    def work(item):
-        begun.append(item)
-        if item == 2:
-            raise ArithmeticError(item)
-        time.sleep(0.01)
-        return item
-
+    taken.clear()
     with pytest.raises(ArithmeticError):
-        [*as_done(work, range(100), slots)]
-    assert len(begun) <= 2 + 2 * slots
+        [*as_done(work, items(100), slots)]
+    assert len(taken) <= 8 + 2 * slots

@@ -24,6 +24,7 @@ CHAOTIC = (
     "scene.load.torque_N_m=1",
     "objective.motion=ensemble",
 )
+SMALL = ("ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16")
 INSIDE = (30.0, 4.0, 3.0)
 
 
@@ -73,8 +74,9 @@ def test_gradient_is_that_of_the_orbit(orbit):
     """The gradient estimated from close neighbours agrees with the implicit one.
 
     The difference is within the estimate's own standard error, which is small."""
-    small = "ensemble.spread=0.005", "ensemble.designs=16"
-    evaluation = averaged(*PERIODIC, *small, gradient=True, design=INSIDE)
+    evaluation = averaged(
+        *PERIODIC, "ensemble.spread=0.005", "ensemble.designs=16", gradient=True, design=INSIDE
+    )
     found, truth = rows(evaluation.gradient), rows(orbit.gradient)
     errors = rows(evaluation.steady_state["gradient_standard_error"])
     size = np.max(np.abs(truth), axis=1, keepdims=True)
@@ -133,8 +135,7 @@ def test_standard_error_of_the_slope_is_honest():
 
 
 def test_chaos_is_averaged_and_named():
-    size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
-    evaluation = averaged(*CHAOTIC, *size, survey=False)
+    evaluation = averaged(*CHAOTIC, *SMALL, survey=False)
     steady = evaluation.steady_state
     assert (evaluation.status, evaluation.usable) == (Status.AVERAGED, True)
     assert steady["kind"] == "chaotic"
@@ -149,9 +150,8 @@ def test_chaos_is_averaged_and_named():
 @pytest.mark.long
 def test_gradient_of_chaos_has_its_standard_error():
     """Estimates of two seeds differ by as much as their standard errors state."""
-    size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
     both = [
-        averaged(*CHAOTIC, *size, "ensemble.spread=0.2", f"ensemble.seed={seed}", gradient=True)
+        averaged(*CHAOTIC, *SMALL, "ensemble.spread=0.2", f"ensemble.seed={seed}", gradient=True)
         for seed in (0, 1)
     ]
     first, second = (rows(one.gradient) for one in both)
@@ -165,7 +165,7 @@ def test_gradient_of_chaos_has_its_standard_error():
 
 
 def test_same_seed_same_numbers():
-    size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
+    size = "ensemble.members=4", "ensemble.settle_periods=2", "ensemble.periods=2"
     first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
     assert first.response == again.response
     np.testing.assert_array_equal(first.start, again.start)
@@ -212,14 +212,12 @@ def told(monkeypatch, run, gradient=False):
 
 
 def test_responses_stand_where_they_belong(monkeypatch):
+    """They are those of the members; members that never touch are idle, with gradients of zero."""
     evaluation = told(monkeypatch, lambda number: sound(3.0))
     assert evaluation.status is Status.AVERAGED
     assert evaluation.response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
     steady = [evaluation.steady_state[key] for key in (*ERRORS.values(), "greatest_force_N")]
     assert steady == pytest.approx([0, np.std(np.arange(4), ddof=1) / 2, 0, 27])
-
-
-def test_members_that_never_touch_are_idle(monkeypatch):
     evaluation = told(monkeypatch, lambda number: sound(0.0)._replace(means=np.zeros((4, 3))))
     assert evaluation.status is Status.IDLE
     assert set(evaluation.response.values()) == {0.0}

@@ -191,20 +191,18 @@ def test_a_line_of_another_run_is_dropped(path):
     other = path.with_name("other")
     sweep(other, plan=plan_of({SPEED: "1,2,3,4,5,6,7,9"})).add([(2, ROW)])
     path.write_bytes(filled(path) + other.read_bytes().splitlines(keepends=True)[1])
-    journal = sweep(path, resume=True)
-    assert "1 line is damaged or of another run, and dropped; 6 results are kept" in journal.damage
+    told = "1 line is damaged or of another run, and dropped; 6 results are kept"
+    assert told in sweep(path, resume=True).damage
 
 
 def test_a_run_that_does_not_resume_keeps_the_older_file(path):
+    """A file without results is not left behind, so that there is none to keep."""
+    sweep(path).close()
+    assert not [*path.parent.iterdir()]
     assert set_aside(path) is None
     data, older = filled(path), path.with_name("points.old")
     assert set_aside(path) == older
     assert older.read_bytes() == data
-
-
-def test_a_file_without_results_is_not_left_behind(path):
-    sweep(path).close()
-    assert not [*path.parent.iterdir()]
 
 
 def test_a_full_disk_does_not_end_the_run(path):

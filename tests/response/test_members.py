@@ -56,11 +56,10 @@ def test_averages_of_a_member(monkeypatch):
         half = periods // 2
         drift = np.mean(window[-half:]) - np.mean(window[:half]) if half else 0.0
         assert float(found.drift) == pytest.approx(drift, rel=1e-12)
-        assert float(found.greatest) == pytest.approx(np.max(peaks))
-        assert float(found.depth) == pytest.approx(np.max(-window))
-        assert float(found.states[0]) == settle + periods
-        assert not np.any(found.repeats)
-        assert (bool(found.stalled), bool(found.solved)) == (False, True)
+        extremes = float(found.greatest), float(found.depth), float(found.states[0])
+        assert extremes == pytest.approx((np.max(peaks), np.max(-window), settle + periods))
+        flags = bool(np.any(found.repeats)), bool(found.stalled), bool(found.solved)
+        assert flags == (False, False, True)
 
 
 def averages_from(state):
@@ -113,8 +112,7 @@ def test_slopes_and_errors_per_config_unit():
     dR/dp = dR/dx (dp/dx)⁻¹, with a Jacobian that is far from symmetric."""
     rng = np.random.default_rng(11)
     jacobian = np.array([[2.0, 0.0, 0.0], [1.5, 0.5, 0.0], [-4.0, 1.0, 3.0]])
-    slope = rng.normal(size=(2, 3))
-    roots = rng.normal(size=(2, 3, 3))
+    slope, roots = (rng.normal(size=size) for size in ((2, 3), (2, 3, 3)))
     covariance = roots @ roots.transpose(0, 2, 1)
     found, errors = ensemble.per_config_unit(slope, covariance, jacobian)
     for k in range(2):

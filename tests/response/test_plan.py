@@ -16,31 +16,44 @@ SPEED, LOAD, ANGLE = "scene.speed_rpm", "scene.load.torque_N_m", "profile.pressu
 
 
 @pytest.mark.parametrize(
-    ("zipped", "shape", "values"),
+    ("axes", "zipped", "sizes", "points"),
     [
-        (False, (2, 2), [(1, 4.0), (1, 5.0), (2, 4.0), (2, 5.0)]),
-        (True, (2,), [(1, 4.0), (2, 5.0)]),
+        (
+            {SPEED: "1,2", LOAD: [4.0, 5.0]},
+            False,
+            {SPEED: 2, LOAD: 2},
+            [(1, 4.0), (1, 5.0), (2, 4.0), (2, 5.0)],
+        ),
+        ({SPEED: "1,2", LOAD: [4.0, 5.0]}, True, {"point": 2}, [(1, 4.0), (2, 5.0)]),
+        (
+            {SPEED: "1,2", ANGLE: "7,8,9", LOAD: "4,5"},
+            [[SPEED, LOAD]],
+            {"point": 2, ANGLE: 3},
+            [(1, 4, 7), (1, 4, 8), (1, 4, 9), (2, 5, 7), (2, 5, 8), (2, 5, 9)],
+        ),
+        (
+            {"a": "1", "b": "2", "c": "3", "d": "4"},
+            [["a", "b"], ["d", "c"]],
+            {"point_1": 1, "point_2": 1},
+            [(1, 2, 3, 4)],
+        ),
+        # Values of zipped keys may repeat.
+        ({SPEED: "1,1,2", LOAD: "3,4,3"}, True, {"point": 3}, [(1, 3), (1, 4), (2, 3)]),
+        # For the config to refuse.
+        (
+            {"profile.lobes": [True, 1, 10**400]},
+            False,
+            {"profile.lobes": 3},
+            [(True,), (1,), (10**400,)],
+        ),
     ],
 )
-def test_keys_are_crossed_or_advance_together(zipped, shape, values):
-    plan = plan_of({SPEED: "1,2", LOAD: [4.0, 5.0]}, zipped=zipped)
-    assert (plan.shape, plan.count, plan.keys) == (shape, len(values), (SPEED, LOAD))
-    assert [tuple(plan.at(number).values()) for number in range(plan.count)] == values
-
-
-def test_groups_of_keys_advance_together():
-    part = plan_of({SPEED: "1,2", ANGLE: "7,8,9", LOAD: "4,5"}, zipped=[[SPEED, LOAD]])
-    assert part.shape == (2, 3)
-    assert [one.name for one in part.dimensions] == ["point", ANGLE]
-    assert part.at(4) == {SPEED: 2, LOAD: 5, ANGLE: 8}
-    pairs = plan_of({"a": "1", "b": "2", "c": "3", "d": "4"}, zipped=[["a", "b"], ["d", "c"]])
-    assert [one.name for one in pairs.dimensions] == ["point_1", "point_2"]
-
-
-def test_values_of_zipped_and_drawn_keys_may_repeat():
-    assert plan_of({SPEED: "1,1,2", LOAD: "3,4,3"}, zipped=True).count == 3
-    assert plan_of({"profile.lobes": "2:3"}, sobol=8).count == 8
-    assert plan_of({"profile.lobes": [True, 1, 10**400]}).count == 3  # for the config to refuse
+def test_keys_are_crossed_or_advance_together(axes, zipped, sizes, points):
+    plan = plan_of(axes, zipped=zipped)
+    assert {one.name: one.size for one in plan.dimensions} == sizes
+    assert (plan.shape, plan.count) == (tuple(sizes.values()), len(points))
+    assert {*plan.keys} == {*axes}
+    assert [tuple(plan.at(number).values()) for number in range(plan.count)] == points
 
 
 def test_samples_follow_from_their_seed():
@@ -60,6 +73,8 @@ def test_sobol_fills_every_part():
     """A sample of 2^m points has one in each of 2^m equal parts of every axis."""
     (column,) = plan_of({SPEED: "0:16"}, sobol=16).dimensions[0].columns.values()
     assert sorted(int(x) for x in column) == list(range(16))
+    # Drawn values may repeat.
+    assert plan_of({"profile.lobes": "2:3"}, sobol=8).count == 8
 
 
 @pytest.mark.parametrize(
@@ -107,8 +122,8 @@ def test_scenes_of_tolerances():
     config = load_config("cic_drawn").replaced({"tolerances": {"over": over}})
     plain, plan = scattered(config, 8)
     assert (plain.tolerances, plan.method, plan.count) == (None, "tolerances", 8)
-    columns = [*map(list, plan.dimensions[0].columns.values())]
-    assert columns == draw(config, 8, fresh=True).T.tolist()
+    columns = plan.dimensions[0].columns.values()
+    assert [*map(list, columns)] == draw(config, 8, fresh=True).T.tolist()
     check_values(plain, plan)
     for wrong in ((load_config("cic_drawn"), 8), (config, 0)):
         with pytest.raises(InputError, match="--tolerances"):

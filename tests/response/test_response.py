@@ -16,7 +16,7 @@ import pytest
 import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import Scene, Status, steady_response
-from rootsopt.response import terms
+from rootsopt.response import steady, terms
 from tests.standins import for_a_time, registered
 
 TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
@@ -92,7 +92,7 @@ def test_response_of_the_shipped_scene(known):
 
 
 def test_derivatives_by_design_and_scene_are_those_of_differences(scene, known):
-    response, _, values, jacobian = known
+    response, found, values, jacobian = known
 
     def moved(number, step):
         entries = [jnp.asarray(DESIGN), *values]
@@ -120,6 +120,10 @@ def test_derivatives_by_design_and_scene_are_those_of_differences(scene, known):
     )
     # Multipliers are constants, and leave the other derivatives as they are.
     assert all(np.all(slope[3] == 0) for slope in jacobian)
+    # Forward mode agrees with reverse mode.
+    _, change = jax.jvp(found, (jnp.asarray(DESIGN), *values), (jnp.asarray(along), *values))
+    parts = [np.dot(jacobian[0], along), *map(np.multiply, jacobian[1:], values)]
+    np.testing.assert_allclose(change, sum(parts), rtol=1e-10)
 
 
 PARTS = {
@@ -205,65 +209,24 @@ def test_derivatives_with_respect_to_quantities_of_parts(kind):
         assert np.all(abs(jacobian[k] * value - slope) <= allowed), name
 
 
-def test_forward_and_reverse_agree(known):
-    _, found, values, jacobian = known
-    arguments = jnp.asarray(DESIGN), *values
-    _, change = jax.jvp(found, arguments, (jnp.array([1.0, 2.0, 3.0]), *values))
-    parts = [np.dot(jacobian[0], [1.0, 2.0, 3.0]), *map(np.multiply, jacobian[1:], values)]
-    np.testing.assert_allclose(change, sum(parts), rtol=1e-10)
-
-
-def test_composes_with_jit_and_vmap(scene, known):
-    """`jit(vmap(value_and_grad))` works over scenes and designs, one of which passes through.
-
-    That one has NaN forces and gradient, and leaves the others as they are. So have designs that
-    are not sound; their margins tell why."""
-    response, *_, jacobian = known
-    unsound = {"undercut": (20, 9, 4), "limits": (36.43, 9.2, 4), "turning": (np.nan, 9, 4)}
-    count = 2 + len(unsound)
-    loads = jnp.array([1.0, 3000.0, *[1.0] * len(unsound)]) * scene.load_torque
-    scenes = eqx.tree_at(lambda s: s.load_torque, scene, loads)
-    axes = jax.tree.map(lambda x: 0 if jnp.shape(x) == (count,) else None, scenes)
-
-    def mean(design, scene):
-        found = steady_response(scene, design)
-        return found.mean, found
-
-    both = jax.vmap(jax.value_and_grad(mean, has_aux=True), (0, axes))
-    designs = jnp.asarray([DESIGN, DESIGN, *unsound.values()])
-    (values, found), slopes = jax.jit(both)(designs, scenes)
-    expected = [Status.PERIODIC, Status.PASSED_THROUGH, *[Status.UNSOUND] * len(unsound)]
-    assert [Status.of(code) for code in found.status] == expected
-    rows = [jax.tree.map(lambda x, k=k: x[k], found.margins) for k in range(count)]
-    assert [row.failed for row in rows] == ["", "", *unsound]
-    for lost in (found.state[2:], found.peak[1:], slopes[1:], values[1:]):
-        assert np.all(np.isnan(lost))
-    assert float(values[0]) == pytest.approx(float(response.mean), rel=1e-9)
-    np.testing.assert_allclose(slopes[0], jacobian[0][0], rtol=1e-6)
-
-
-def test_batch_is_computed_one_by_one(scene):
-    """On a CPU, motions of a batch are computed one by one.
+def test_batch_is_computed_one_by_one(scene, known, monkeypatch):
+    """On a CPU, motions of a batch are computed one by one; on a GPU, together.
 
     As arrays, every motion would take as long as all of them."""
 
-    def mean(design):
-        return steady_response(scene, design).mean
+    def solved(scene, design, *_):
+        """Stand in for a solution; it has no loop of its own."""
+        return known[0]._replace(mean=jnp.sum(design)), design
 
-    def operations(jaxpr, loops):
-        """Count the operations of a program, with or without those inside its `scan` loops."""
-        inner = [
-            getattr(one, "jaxpr", one)
-            for equation in jaxpr.eqns
-            if loops or equation.primitive.name != "scan"
-            for value in equation.params.values()
-            for one in (value if isinstance(value, tuple) else (value,))
-        ]
-        inner = [one for one in inner if hasattr(one, "eqns")]
-        return len(jaxpr.eqns) + sum(operations(one, loops) for one in inner)
+    def loops(backend):
+        monkeypatch.setattr(jax, "default_backend", lambda: backend)
+        means = jax.vmap(lambda design: steady_response(scene, design).mean)
+        return "scan[" in str(jax.make_jaxpr(means)(jnp.stack([DESIGN] * 7)))
 
-    batch = jax.make_jaxpr(jax.vmap(mean))(jnp.stack([DESIGN] * 7)).jaxpr
-    assert 100 * operations(batch, loops=False) < operations(batch, loops=True)
+    monkeypatch.setattr(steady, "_solve", solved)
+    # JAX would keep what it has traced.
+    monkeypatch.setattr(steady, "_inline", steady._once)
+    assert (loops("cpu"), loops("gpu")) == (True, False)
 
 
 @pytest.mark.long
@@ -302,7 +265,9 @@ def test_design_without_parameters():
     assert (by_design.shape, by_scene.speed.shape) == ((0,), ())
 
 
-def test_second_derivatives_are_refused(scene):
+def test_second_derivatives_are_refused(scene, monkeypatch):
+    # Without tracing a solution that is not used.
+    monkeypatch.setattr(steady, "_inline", steady._once)
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         jax.hessian(lambda design: steady_response(scene, design).mean)(DESIGN)
 
@@ -316,20 +281,6 @@ def test_designs_of_another_size_are_refused(scene, design, message):
         steady_response(scene, design)
 
 
-def example_of(name):
-    """Return the example in the docstring of a public name.
-
-    The docstring of a constant stands below it; the version is shown in that of the package."""
-    value = getattr(rootsopt, name)
-    text = rootsopt.__doc__ if name == "__version__" else inspect.getdoc(value)
-    if isinstance(value, dict):
-        source = inspect.getsource(sys.modules[rootsopt._PUBLIC[name]])
-        (text,) = re.findall(rf'^{name}.*?^"""(.*?)"""', source, re.M | re.S)
-    found = doctest.DocTestParser().get_doctest(text, {}, name, None, 0)
-    assert "rootsopt" in "".join(one.source for one in found.examples), "no example"
-    return found
-
-
 _SLOW = "identify", "Identification"
 """Names whose examples fit a record, which `tests/identification` does faster."""
 
@@ -339,9 +290,17 @@ _SLOW = "identify", "Identification"
     [pytest.param(one, marks=[pytest.mark.long] * (one in _SLOW)) for one in rootsopt.__all__],
 )
 def test_example_in_the_docstring_runs(name, monkeypatch):
-    """It prints what it says, and sets double precision itself where it needs it."""
+    """It prints what it says, and sets double precision itself where it needs it.
+
+    The docstring of a constant stands below it; the version is shown in that of the package."""
+    value = getattr(rootsopt, name)
+    text = rootsopt.__doc__ if name == "__version__" else inspect.getdoc(value)
+    if isinstance(value, dict):
+        source = inspect.getsource(sys.modules[rootsopt._PUBLIC[name]])
+        (text,) = re.findall(rf'^{name}.*?^"""(.*?)"""', source, re.M | re.S)
+    example, told = doctest.DocTestParser().get_doctest(text, {}, name, None, 0), []
+    assert "rootsopt" in "".join(one.source for one in example.examples), "no example"
     monkeypatch.setattr(terms, "_terms", dict(terms._terms))
-    example, told = example_of(name), []
     jax.config.update("jax_enable_x64", False)
     try:
         with for_a_time():

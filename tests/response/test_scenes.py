@@ -34,15 +34,14 @@ def test_grid_of_any_keys(config):
     assert found.mean_force_N.dims == (LOAD, CLEARANCE)
     assert found.status.values.tolist() == [["periodic", "idle"], ["passed_through"] * 2]
     point = {LOAD: 4.0, CLEARANCE: 0.0}
-    one = rootsopt.evaluate(config.replaced(point))
-    here = found.sel(point)
+    one, here = rootsopt.evaluate(config.replaced(point)), found.sel(point)
     assert float(here.mean_force_N) == one.response["mean_force_N"]
     slope = one.gradient["outer_radius_mm"]["involute_length_mm"]
     assert float(here.gradient_outer_radius_mm.sel(design_key="involute_length_mm")) == slope
     assert float(here.area_efficiency) == one.geometry["area_efficiency"]
     first, *_ = one.steady_state["floquet_multipliers"]
-    real, imaginary = here.floquet_multiplier_real, here.floquet_multiplier_imaginary
-    assert [float(real[0]), float(imaginary[0])] == first
+    parts = here.floquet_multiplier_real, here.floquet_multiplier_imaginary
+    assert [float(part[0]) for part in parts] == first
     assert abs(complex(*first)) == pytest.approx(float(here.floquet_multiplier), rel=1e-12)
     assert found.mean_force_N.attrs == {"units": "N", "long_name": "mean contact force"}
     assert found[LOAD].attrs["units"] == "N m"

@@ -25,8 +25,8 @@ TIGHT = "solver.rtol=1e-10"
 POINT = np.array([0.2, 0.3, 0.4])
 
 
-def config_of(*overrides):
-    return load(CIC, overrides)
+def config_of(*overrides, file=CIC):
+    return load(file, overrides)
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +70,11 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
 
     The scene's own speed comes first in the record, without a share."""
     evaluator, found, _ = baseline
-    shares = [(part.speed_rpm, part.share) for part in found.speeds]
-    assert shares == [(2000, 0.25), (3000, 0), (4000, 0.75)]
+    assert [(part.speed_rpm, part.share) for part in found.speeds] == [
+        (2000, 0.25),
+        (3000, 0),
+        (4000, 0.75),
+    ]
     alone = {speed: single for speed, (single, _) in singles.items()} | {3000: found}
     for part in found.speeds:
         single = alone[part.speed_rpm]
@@ -96,8 +99,8 @@ def test_objective_is_the_weighted_mean_or_the_worst(baseline, singles, moved):
     worst = Problem.of(config_of(SPEEDS, WORST), evaluator.scene, base)
     assert worst.objective(moved) == pytest.approx(max(values), rel=1e-7)
     assert [one.objective(base) for one in (problem, worst)] == pytest.approx([1, 1], abs=1e-14)
-    found = [row["objective"] for row in problem.by_speed(moved) if row["share"]]
-    assert found == pytest.approx(values, rel=1e-7)
+    rows = (row for row in problem.by_speed(moved) if row["share"])
+    assert [row["objective"] for row in rows] == pytest.approx(values, rel=1e-7)
 
 
 def test_slope_agrees_with_central_differences(baseline, moved):
@@ -170,9 +173,10 @@ def test_refusals_name_the_key(overrides, words):
 
 
 def test_speeds_of_a_config():
-    """A config says which speeds are simulated and which count; so does the resolved config."""
+    """A config says which speeds are simulated and which count; so does the resolved config.
+
+    Those of several speeds are checked with their evaluations."""
     config = config_of(SPEEDS, WEIGHTS)
-    assert reducers.shares(config) == {2000: 0.25, 3000: 0, 4000: 0.75}
     assert reducers.shares(reducers.alone(config)) == {3000: 1}
     assert reducers.shares(config_of("objective.speeds_rpm=[3000]")) == {3000: 1}
     assert parse(config.to_yaml()) == config
@@ -226,6 +230,6 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     assert found.message.startswith(f"At {failing:g} rpm: ")
     assert found.statistics["seconds"] == 3
     parts = [part._replace(evaluation=evaluation_of()) for part in found.speeds]
-    assert overall(parts)[0] is Status.PERIODIC
-    wrong = [Part({"speed_rpm": 1.0}, evaluation_of(status=Status.CHAOTIC)), *parts]
-    assert overall(wrong)[0] is Status.CHAOTIC
+    chaotic = Part({"speed_rpm": 1.0}, evaluation_of(status=Status.CHAOTIC))
+    statuses = overall(parts)[0], overall([chaotic, *parts])[0]
+    assert statuses == (Status.PERIODIC, Status.CHAOTIC)

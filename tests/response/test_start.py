@@ -1,4 +1,6 @@
-"""`Response.start`: an orbit that travels through pure functions to similar designs and scenes."""
+"""`Response.start`: an orbit that travels through pure functions to similar designs and scenes.
+
+One program, `respond`, serves most tests: it maps a sweep over designs, scenes and starts."""
 
 import pickle
 from unittest import mock
@@ -18,6 +20,8 @@ CONFIG = rootsopt.load_config("configs/cic_drawn.yaml")
 DESIGN = np.asarray(CONFIG.design, float)
 NEAR = DESIGN * np.array([1.002, 0.999, 1.001])
 SPEEDS = np.array([1.0, 1.01, 1.02])
+# Factors of speed and load.
+ALONE = np.ones(2)
 
 
 @pytest.fixture(scope="module")
@@ -26,31 +30,87 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def respond():
-    """Return the compiled function of (scene, design, start): derivatives and responses at three
-    speeds, each from the orbit of the one before."""
+def respond(scene):
+    """Return the function (six cases by name) → derivatives and responses at three speeds, each
+    from the orbit of the one before, by name.
+
+    A case is (design, factors of speed and load, start)."""
 
     def forces(design, scene, start):
         found = steady_response(scene, design, start)
         return jnp.stack([found.mean, found.rms, found.peak]), found
 
-    @eqx.filter_jit
-    def sweep(scene, design, start):
+    def sweep(scene, design, factors, start):
         def step(start, factor):
-            moved = eqx.tree_at(lambda s: s.speed, scene, factor * scene.speed)
-            found = jax.jacfwd(forces, has_aux=True)(design, moved, start)
+            speed, load = factors * jnp.stack([factor * scene.speed, scene.load_torque])
+            moved = eqx.tree_at(lambda s: (s.speed, s.load_torque), scene, (speed, load))
+            found = jax.jacrev(forces, has_aux=True)(design, moved, start)
             return found[1].start, found
 
         return jax.lax.scan(step, start, SPEEDS)[1]
 
-    return sweep
+    program = jax.jit(jax.vmap(sweep, (None, 0, 0, 0)))
+
+    def by_name(cases):
+        # As arrays of NumPy, all starts have the same types, so that JAX compiles once.
+        arrays = (
+            jax.tree.map(lambda *x: np.stack(x), *part)
+            for part in zip(*cases.values(), strict=True)
+        )
+        found = jax.device_get(program(scene, *arrays))
+        return {name: jax.tree.map(lambda x, k=k: x[k], found) for k, name in enumerate(cases)}
+
+    return by_name
+
+
+def at_first(found):
+    return jax.tree.map(lambda x: x[0], found)
+
+
+def at_rest(start):
+    return eqx.tree_at(lambda s: s.state, start, np.zeros(2))
 
 
 @pytest.fixture(scope="module")
-def first(scene, respond):
-    """Return the response from rest, by the program that takes a start."""
-    _, found = respond(scene, DESIGN, unused(steady_response(scene, DESIGN, np.zeros(2)).start))
-    return jax.tree.map(lambda x: x[0], found)
+def from_rest(scene, respond):
+    """Return derivatives and responses from rest, by the program that takes a start."""
+    start = at_rest(steady_response(scene, DESIGN, np.zeros(2)).start)
+    start = eqx.tree_at(lambda s: s.known.sound, start, np.zeros((), bool))
+    cases = {
+        "own": (DESIGN, ALONE),
+        "near": (NEAR, ALONE),
+        "slow": (DESIGN, np.array([0.3, 1.0])),
+        "overloaded": (DESIGN, np.array([1.0, 3000.0])),
+        "undercut": (np.array([20.0, 9.0, 4.0]), ALONE),
+        "limits": (np.array([36.43, 9.2, 4.0]), ALONE),
+    }
+    return respond({name: (*case, start) for name, case in cases.items()})
+
+
+@pytest.fixture(scope="module")
+def start(from_rest):
+    """Return the start of the own design, which comes from a file."""
+    return pickle.loads(pickle.dumps(at_first(from_rest["own"][1].start)))
+
+
+@pytest.fixture(scope="module")
+def from_neighbour(respond, from_rest, start):
+    """Return derivatives and responses that begin on another orbit, most of which are of no use."""
+    slopes = start.known.elements.slopes
+    damaged = {
+        "noise": slopes + 30.0,
+        "not a number": np.full_like(slopes, np.nan),
+        "another orbit": np.zeros_like(slopes),
+    }
+    starts = {
+        name: eqx.tree_at(lambda s: s.known.elements.slopes, start, one)
+        for name, one in damaged.items()
+    }
+    starts["other speed"] = at_first(from_rest["slow"][1].start)
+    cases = {name: (NEAR, ALONE, at_rest(one)) for name, one in starts.items()}
+    cases["near"] = NEAR, ALONE, start
+    cases["turning"] = np.array([np.nan, 9.0, 4.0]), ALONE, start
+    return respond(cases)
 
 
 def same(one, other, forces=1e-8, slopes=1e-6):
@@ -61,9 +121,8 @@ def same(one, other, forces=1e-8, slopes=1e-6):
     np.testing.assert_allclose(by_one, by_other, rtol=slopes, atol=slopes * np.max(abs(by_other)))
 
 
-def test_neighbour_gives_the_response_from_rest(scene, respond, first):
-    usual = respond(scene, NEAR, unused(first.start))
-    found = respond(scene, NEAR, first.start)
+def test_neighbour_gives_the_response_from_rest(scene, from_rest, from_neighbour):
+    usual, found = from_rest["near"], from_neighbour["near"]
     same(found, usual)
     assert np.all(found[1].start.known.sound)
     # Without a transient, the states come from the orbit of the neighbour.
@@ -75,41 +134,44 @@ def test_neighbour_gives_the_response_from_rest(scene, respond, first):
         np.testing.assert_allclose(forces, [alone.mean, alone.peak], rtol=1e-8)
 
 
-def unused(start):
-    """Return a start at rest, without an orbit, in the form of `start`."""
-    at_rest = eqx.tree_at(lambda s: s.state, start, jnp.zeros_like(start.state))
-    return eqx.tree_at(lambda s: s.known.sound, at_rest, jnp.zeros((), bool))
-
-
 @pytest.mark.parametrize("damage", ["other speed", "noise", "not a number", "another orbit"])
-def test_start_of_no_use_does_not_change_the_response(scene, respond, first, damage):
+def test_start_of_no_use_does_not_change_the_response(from_rest, from_neighbour, damage):
     """An orbit that does not lead to one of the pair is refused, and the search begins at rest."""
-    start, usual = first.start, respond(scene, NEAR, unused(first.start))
-    if damage == "other speed":
-        slow = eqx.tree_at(lambda s: s.speed, scene, 0.3 * scene.speed)
-        slower = respond(slow, DESIGN, unused(first.start))[1].start
-        start = jax.tree.map(lambda x: x[0], slower)
-    else:
-        share, more = {"noise": (1, 30.0), "not a number": (1, jnp.nan), "another orbit": (0, 0)}[
-            damage
-        ]
-        start = eqx.tree_at(
-            lambda s: s.known.elements.slopes, start, replace_fn=lambda x: share * x + more
-        )
-    start = eqx.tree_at(lambda s: s.state, start, jnp.zeros_like(start.state))
-    same(respond(scene, NEAR, start), usual)
+    same(from_neighbour[damage], from_rest["near"])
 
 
-def test_start_survives_a_file(scene, respond, first):
-    again = pickle.loads(pickle.dumps(jax.device_get(first.start)))
-    one, other = (respond(scene, NEAR, start) for start in (first.start, again))
-    jax.tree.map(np.testing.assert_array_equal, one, other)
+def test_batch_is_computed_as_single_motions(scene, from_rest, from_neighbour):
+    """`jit(vmap(jacrev))` works over scenes and designs, one of which passes through.
+
+    That one has NaN forces and gradient, and leaves the others as they are. So have designs that
+    are not sound; their margins tell why."""
+    slopes, found = at_first(from_rest["own"])
+    alone = steady_response(scene, DESIGN, np.zeros(2))
+    forces = [[one.mean, one.rms, one.peak] for one in (found, alone)]
+    np.testing.assert_allclose(*forces, rtol=1e-9)
+    gradient = Evaluator.of(CONFIG)(series=False).gradient
+    names = "mean_force_N", "rms_force_N", "peak_force_N"
+    expected = np.array([[*gradient[name].values()] for name in names])
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-6 * size)
+    assert found.margins.failed == ""
+    for name in ("overloaded", "undercut", "limits", "turning"):
+        slopes, found = at_first((from_rest | from_neighbour)[name])
+        passed = name == "overloaded"
+        assert Status.of(found.status) is (Status.PASSED_THROUGH if passed else Status.UNSOUND)
+        assert found.margins.failed == ("" if passed else name)
+        assert np.all(np.isnan([*slopes.ravel(), found.mean, found.rms, found.peak]))
+        assert passed or np.all(np.isnan(found.state))
 
 
-def test_start_of_another_kind_is_refused(scene, first):
+def test_start_survives_a_file(from_rest, start):
+    jax.tree.map(np.testing.assert_array_equal, start, at_first(from_rest["own"][1].start))
+
+
+def test_start_of_another_kind_is_refused(scene, start):
     other = rootsopt.load_config("configs/ee.yaml")
     for arguments, words in (
-        ((Scene.from_config(other), other.design, first.start), "same kind of scene"),
+        ((Scene.from_config(other), other.design, start), "same kind of scene"),
         ((scene, DESIGN, np.zeros(3)), r"state \(2,\) of this scene"),
     ):
         with pytest.raises(ValueError, match=words):

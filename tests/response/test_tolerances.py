@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from scipy.stats.mstats import hdquantiles
 
 from rootsopt import Scene, Status
-from rootsopt.config import load, parse
+from rootsopt.config import parse
 from rootsopt.config.tolerances import TolerancesConfig, scatterable
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import plain_evaluation, read_evaluation
 from rootsopt.response.reducers import combine
 from rootsopt.response.scatter import draw, quantiles, shifts
+from tests.response.test_speeds import CIC, config_of
 from tests.standins import evaluation_of, programs, refusal
 
-CIC = "configs/cic_drawn.yaml"
 PLAY = "contact.clearance_mm=0.01"
 CLEARANCE = "tolerances.over.contact.clearance_mm.normal=0.002"
 BACKLASH = "tolerances.over.scene.timing_gear.backlash_mm.uniform=0.02"
@@ -32,10 +32,6 @@ SPREAD = (
     "tolerances.over.scene.load.torque_N_m.relative_triangular=0.05",
     "tolerances.over.profile.tip_arc_angle_deg.normal=0.02",
 )
-
-
-def config_of(*overrides, file=CIC):
-    return load(file, overrides)
 
 
 def test_config_names_distributions_in_two_ways():

@@ -1,5 +1,7 @@
 """Values that XLA computes once."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,10 +36,7 @@ def waves(function, *arguments):
 def test_what_is_kept_does_not_change():
     """Integers, single numbers, infinite values and arrays of any nested batch pass unchanged."""
     tree = {"number": 3.0 * ANGLES[0], "count": jnp.arange(3), "far": jnp.full(40, jnp.inf)}
-    for found, given in zip(
-        jax.tree.leaves(compute_once(tree)), jax.tree.leaves(tree), strict=True
-    ):
-        np.testing.assert_array_equal(found, given)
+    jax.tree.map(np.testing.assert_array_equal, compute_once(tree), tree)
     square = ANGLES.reshape(8, 8)
     row = jax.vmap(jax.vmap(lambda x: compute_once((x, jnp.arange(4.0)))))(square)
     np.testing.assert_array_equal(row[0], square)
@@ -81,7 +80,6 @@ def derivatives(through):
 )
 def test_values_are_computed_once(repeated, once, share):
     """Values and derivatives are the same. XLA alone repeats cosine, sine and inner derivative."""
-    pairs = zip(jax.tree.leaves(repeated(ANGLES)), jax.tree.leaves(once(ANGLES)), strict=True)
-    for value, other in pairs:
-        np.testing.assert_allclose(value, other, rtol=1e-13, atol=1e-13)
+    same = functools.partial(np.testing.assert_allclose, rtol=1e-13, atol=1e-13)
+    jax.tree.map(same, repeated(ANGLES), once(ANGLES))
     assert waves(once, ANGLES) < share * waves(repeated, ANGLES)

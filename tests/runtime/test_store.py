@@ -46,6 +46,8 @@ DAMAGE = {
     "checksum": lambda data: flipped(data, len(store._HEADER)),
     "first byte": lambda data: flipped(data, len(store._HEADER) + 32),
     "last byte": lambda data: flipped(data, len(data) - 1),
+    "that of another name": lambda data: store._checksum("b", "for a", DATA) + DATA,
+    "that of another purpose": lambda data: store._checksum("a", "for b", DATA) + DATA,
 }
 
 
@@ -56,14 +58,6 @@ def test_a_damaged_entry_is_none(kept, how):
     assert made.read("a", "for a") is None
     made.write("a", "for a", DATA)
     assert made.read("a", "for a") == DATA
-
-
-def test_an_exchanged_entry_is_none(kept):
-    made, file = kept
-    made.write("b", "for b", DATA)
-    assert made.read("b", "for a") is None
-    file.with_name("b.program").write_bytes(file.read_bytes())
-    assert made.read("b", "for b") is made.read("b", "for a") is None
 
 
 @posix
@@ -179,9 +173,6 @@ def test_unfinished_files_of_dead_processes_are_removed(folder):
 
 
 def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
-    """The entries unused for longest are deleted; reading counts as use.
-
-    Other files in the folder, older and larger, are left alone."""
     made, file = kept
     size, now = file.stat().st_size, time.time()
     other = file.with_name("of the user")

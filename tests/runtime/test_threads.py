@@ -34,7 +34,7 @@ def mixed(rows, shift):
 def test_work_is_divided_among_the_cores(monkeypatch):
     """Every row is computed once and returned in its place, with the same bits on 1 to 16 cores."""
     rng = np.random.default_rng(0)
-    for count in (1, 2, 5, 8):
+    for count in (1, 5):
         rows, shift = jnp.asarray(rng.normal(size=(count, 300))), jnp.arange(float(count))
         bits = set()
         for cores in (1, 2, 16):
@@ -100,6 +100,7 @@ def test_commands_use_one_thread_whatever_the_user_has_set(monkeypatch):
     assert subprocess.check_output([sys.executable, "-c", script], text=True) == "{1}\n"
 
 
+# A console command on a machine that seems to have as many cores as the first argument says.
 FAKED = """
 import os, sys
 cores = int(sys.argv.pop(1))
@@ -107,7 +108,6 @@ os.cpu_count = lambda: cores
 from rootsopt.commands.console import main
 sys.exit(main())
 """
-"""A console command on a machine that seems to have as many cores as the first argument says."""
 RUNS = {
     "optimize": ["optimizer.screening=4", "optimizer.starts=2", "optimizer.iterations=12"],
     "pareto": ["optimizer.screening=4", "pareto.points=3", "optimizer.iterations=6"],

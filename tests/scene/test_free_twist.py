@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rootsopt
-from rootsopt import InputError, Scene
+from rootsopt import InputError, Scene, Status, load_config
 from rootsopt.config.units import DEG
 from rootsopt.optimize.search import Search
 from rootsopt.pump.sheet import sheet
+from rootsopt.response.evaluation import Evaluator, build
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.scene.space import Space, bounds_of
 
@@ -17,20 +17,19 @@ GAS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}
 
 
 def scene_of(name: str, *changes: str) -> tuple[Scene, jnp.ndarray]:
-    config = rootsopt.load_config(name, changes)
+    config = load_config(name, changes)
     return Scene.from_config(config), jnp.asarray(config.design)
 
 
 @pytest.mark.parametrize("name", ["cic_drawn", "ee", "free"])
 def test_twist_is_the_last_parameter(name):
     """Behind those of any family: none, single numbers, or a list."""
-    fixed, free = rootsopt.load_config(name), rootsopt.load_config(name, FREE)
+    fixed, free = load_config(name), load_config(name, FREE)
     assert free.design_keys == (*fixed.design_keys, "helix_deg")
     np.testing.assert_array_equal(free.design, [*fixed.design, 20.0])
     wanted = [*(fixed.design * 0.99), 33.0]
-    moved = free.with_design(wanted)
-    np.testing.assert_array_equal(moved.design, wanted)
-    assert moved.rotor.helix_deg == 33.0
+    np.testing.assert_array_equal(free.with_design(wanted).design, wanted)
+    assert free.with_design(wanted).rotor.helix_deg == 33.0
     assert fixed.with_design(fixed.design) == fixed
     assert bounds_of(free) == [*bounds_of(fixed), (0.0, 90.0)]
     space = Space.of(free, Scene.from_config(free))
@@ -44,7 +43,7 @@ def test_derivatives_are_those_of_the_scene():
     """The pair's derivatives along the last parameter are those with respect to `scene.helix`."""
     free, design = scene_of("ee", *GAS, *FREE)
     assert free.at(design).helix == pytest.approx(20 * DEG)
-    pair, tangents, _ = free.pair_and_tangents(design)
+    pair, tangents, _ = build(free, design)
     # What depends on the twist alone, and only on it.
     np.testing.assert_allclose(tangents.contact.twist, [DEG], rtol=1e-12)
     np.testing.assert_allclose(tangents.load.offsets[0], pair.load.offsets / 20, rtol=1e-12)
@@ -75,7 +74,7 @@ def test_a_fixed_twist_costs_nothing():
         assert scene.at(design) is scene
     # A rotor from a file has no design parameters.
     outline = "profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: x.csv}"
-    assert not rootsopt.load_config("cic_drawn", [outline, FREE[0]]).twist_free
+    assert not load_config("cic_drawn", [outline, FREE[0]]).twist_free
 
 
 @pytest.mark.parametrize(
@@ -90,17 +89,17 @@ def test_a_fixed_twist_costs_nothing():
 def test_impossible_bounds_are_refused(name, changes, words):
     """So is a search without parameters."""
     with pytest.raises(InputError, match=words):
-        Search(rootsopt.load_config(name, changes))
+        Search(load_config(name, changes))
 
 
 @pytest.mark.long
 def test_gradients_against_differences():
     """Forces and loads of the bearings, greatest ones included, of twisted CIC rotors."""
     changes = (*GAS, *FREE, "rotor.helix_deg=40", "solver.rtol=1e-10")
-    config = rootsopt.load_config("cic_drawn", changes)
-    evaluator = rootsopt.response.evaluation.Evaluator.of(config)
+    config = load_config("cic_drawn", changes)
+    evaluator = Evaluator.of(config)
     here = evaluator()
-    assert here.status is rootsopt.Status.PERIODIC
+    assert here.status is Status.PERIODIC
     names = (
         *("mean_force_N", "rms_force_N", "bearing_load_equivalent_N", "bearing_load_max_N"),
         *("axial_force_max_N", "tilting_moment_max_N_m"),

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rootsopt import InputError, Status, load_config
+from rootsopt import InputError, Scene, Status, load_config
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.scene import Scene, design_vector
 from tests.planar import Planar
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -41,7 +40,7 @@ def build(model, design):
 
 def pair_of(overrides, family="cic_drawn"):
     config = load_config(f"configs/{family}.yaml", list(overrides))
-    return build(Scene.from_config(config), design_vector(config))[0], config
+    return build(Scene.from_config(config), jnp.asarray(config.design))[0], config
 
 
 def planar_of(pair, config):
@@ -140,11 +139,10 @@ def test_parts_that_do_not_go_together_are_refused(overrides, words):
 
 
 @pytest.mark.long
-def test_orbit_and_gradient_of_all_parts():
-    """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
+def test_orbit_of_all_parts():
+    """With all parts, eleven states, the orbit closes."""
     config = load_config("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
-    evaluator = Evaluator.of(config)
-    found = evaluator(series=True)
+    found = Evaluator.of(config)()
     assert found.status is Status.PERIODIC
     assert found.steady_state["residual"] < 1e-9
     assert len(found.steady_state["floquet_multipliers"]) == 11
@@ -156,13 +154,3 @@ def test_orbit_and_gradient_of_all_parts():
     mean = np.trapezoid(series.force, series.time) / np.ptp(series.time)
     assert found.response["mean_force_N"] == pytest.approx(mean, rel=2e-3)
     assert found.response["peak_force_N"] == pytest.approx(series.force.max(), rel=2e-3)
-    # Along a direction in which all parameters count.
-    design, step, way = np.asarray(design_vector(config)), 1e-3, np.array([1.0, -0.7, 0.8])
-    ends = [
-        evaluator(jnp.asarray(design + s * step * way), start=found.start, series=False).response
-        for s in (-1, 1)
-    ]
-    for name in ("mean_force_N", "rms_force_N"):
-        slope = (ends[1][name] - ends[0][name]) / (2 * step)
-        along = np.array(list(found.gradient[name].values())) @ way
-        assert along == pytest.approx(slope, rel=1e-5), name

@@ -1,17 +1,11 @@
 """Tests of closed orbits against the same by shooting, which shares only the equation of motion."""
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
 import pytest
-from jaxtyping import Array
 
 import rootsopt
 from experiments.orbits.study import compared
-from rootsopt.dynamics.collocation.events import kinds
-from rootsopt.dynamics.parts.base import Part
-from rootsopt.scene import Scene
-from rootsopt.status import Status
+from rootsopt.dynamics.flanks import has_margins
+from rootsopt.dynamics.parts import TimingGear
 
 LIVELY = [
     "scene.speed_rpm=1700",
@@ -78,44 +72,14 @@ def test_orbit_is_that_by_shooting(name, overrides, period):
     assert row["multiplier_difference"] < 5e-5
 
 
-class _Stop(Part):
-    """A spring on rotor 2 beyond a stop (rad)."""
-
-    stop: Array | float
-
-    def torque_on_2(self, motion, own):
-        return -2e4 * jnp.minimum(motion.relative + self.stop, 0.0)
-
-    def switches(self, motion, own):
-        return self._excess(motion) > 0
-
-    def margins(self, motion, own):
-        return self._excess(motion)
-
-    def _excess(self, motion):
-        return (motion.relative + self.stop)[None]
-
-
-class _Untold(_Stop):
-    """The same, whose flag is newer than its margin."""
+class _Untold(TimingGear):
+    """A gear whose flags are newer than its margins."""
 
     def switches(self, motion, own):
         return super().switches(motion, own)
 
 
-@pytest.mark.long
-def test_flags_without_margins():
-    """Events that only a flag tells are located by it; forces and gradients are the same."""
-    config = rootsopt.load_config("configs/cic_drawn.yaml")
-    scene, design = Scene.from_config(config), jnp.asarray(config.design, float)
-    relative = rootsopt.evaluate(config).series.relative
-    stop = -0.5 * (relative.min() + relative[relative < 0].mean())
-    found = []
-    for kind in (_Stop, _Untold):
-        with_part = scene.with_parts(kind(stop))
-        pair = eqx.filter_jit(Scene.pair)(with_part, design)
-        assert np.any(kinds(pair).vague) == (kind is _Untold)
-        response = eqx.filter_jit(rootsopt.steady_response)(with_part, design)
-        assert response.status == Status.PERIODIC.code
-        found.append((response.mean, response.peak, response.rms))
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+def test_flags_newer_than_margins_have_none():
+    """An orbit with events that only a flag tells is closed in `tests/conformance`."""
+    assert has_margins(TimingGear)
+    assert not has_margins(_Untold)
