@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rootsopt.config import load
+from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from tests.fuzz import outlines
@@ -129,12 +130,12 @@ def test_refused_points_are_said_to_be_scattered(tmp_path):
 
     The advised smoothing is accepted in the end."""
     path = write(tmp_path / "points.csv", scattered(rotor(), 20e-3, seed=2))
-    for keys in ({}, {"smoothing_mm": 2e-3}):
-        told = refusal(read, path, **keys)
-        (said,) = re.findall(r"points are scattered by about ([0-9.]+) um", told)
+    for keys in ({}, {"smoothing_mm": 2e-3}, {"smoothing_mm": 20e-3}):
+        with pytest.raises(InputError) as refused:
+            read(path, **keys)
+        (said,) = re.findall(r"points are scattered by about ([0-9.]+) um", str(refused.value))
         assert float(said) == pytest.approx(20, rel=0.15)
-    told = refusal(read, path, smoothing_mm=20e-3)
-    assert "raise `profile.outline_smoothing_mm` from 0.02 to" in told
+    assert "raise `profile.outline_smoothing_mm` from 0.02 to" in str(refused.value)
     config, _, checks = read(path, smoothing_mm=25e-3)
     assert checks.record()["scatter_um"] == pytest.approx(20, rel=0.15)
     assert not any("scattered" in text for text in advice(config, checks))
