@@ -257,7 +257,7 @@ def test_wrong_arguments_take_one_line(capsys):
 
 
 def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
-    full = OSError(28, "No space left on device", "/tmp/elsewhere")
+    full = OSError(28, "No space left on device", "elsewhere/file")
     monkeypatch.setattr("rootsopt.commands.cli.load", mock.Mock(side_effect=full))
     assert main(["profile", CIC]) == 2
-    assert capsys.readouterr().err == "rootsopt profile: /tmp/elsewhere: no space left on device\n"
+    assert capsys.readouterr().err == "rootsopt profile: elsewhere/file: no space left on device\n"

@@ -29,7 +29,9 @@ def _look(function, start, stop, *given):
     def at(t):
         return function(jax.tree.map(lambda a, b: a + t * (b - a), start, stop), *given)
 
-    slope = lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),), has_aux=True)  # noqa: E731
+    def slope(t):
+        return jax.jvp(at, (t,), (jnp.ones_like(t),), has_aux=True)
+
     return jax.lax.map(slope, jnp.linspace(0.0, 1.0, COUNT))
 
 

@@ -196,7 +196,7 @@ def test_a_line_of_another_run_is_dropped(path):
 
 
 def test_a_run_that_does_not_resume_keeps_the_older_file(path):
-    """A file without results is not left behind, so that there is none to keep."""
+    """A file without results is removed when it is closed. One with results gets another name."""
     sweep(path).close()
     assert not [*path.parent.iterdir()]
     assert set_aside(path) is None

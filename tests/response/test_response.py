@@ -224,7 +224,7 @@ def test_batch_is_computed_one_by_one(scene, known, monkeypatch):
         return "scan[" in str(jax.make_jaxpr(means)(jnp.stack([DESIGN] * 7)))
 
     monkeypatch.setattr(steady, "_solve", solved)
-    # JAX would keep what it has traced.
+    # `_inline` would reuse what JAX traced for the other backend.
     monkeypatch.setattr(steady, "_inline", steady._once)
     assert (loops("cpu"), loops("gpu")) == (True, False)
 

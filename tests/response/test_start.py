@@ -95,7 +95,8 @@ def start(from_rest):
 
 @pytest.fixture(scope="module")
 def from_neighbour(respond, from_rest, start):
-    """Return derivatives and responses that begin on another orbit, most of which are of no use."""
+    """Return derivatives and responses that begin on a neighbour's orbit, or on one that does not
+    help: damaged, or of another speed."""
     slopes = start.known.elements.slopes
     damaged = {
         "noise": slopes + 30.0,
@@ -141,10 +142,11 @@ def test_start_of_no_use_does_not_change_the_response(from_rest, from_neighbour,
 
 
 def test_batch_is_computed_as_single_motions(scene, from_rest, from_neighbour):
-    """`jit(vmap(jacrev))` works over scenes and designs, one of which passes through.
+    """`jit(vmap(jacrev))` works over scenes and designs. Some of them have no forces.
 
-    That one has NaN forces and gradient, and leaves the others as they are. So have designs that
-    are not sound; their margins tell why."""
+    These are a scene whose lobes pass through each other, and designs that are not sound. Their
+    forces and gradients are NaN, and do not change those of the others. The margins say which check
+    a design fails."""
     slopes, found = at_first(from_rest["own"])
     alone = steady_response(scene, DESIGN, np.zeros(2))
     forces = [[one.mean, one.rms, one.peak] for one in (found, alone)]

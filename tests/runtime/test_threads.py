@@ -100,7 +100,7 @@ def test_commands_use_one_thread_whatever_the_user_has_set(monkeypatch):
     assert subprocess.check_output([sys.executable, "-c", script], text=True) == "{1}\n"
 
 
-# A console command on a machine that seems to have as many cores as the first argument says.
+# Runs a console command; its first argument is the number of cores that Python reports.
 FAKED = """
 import os, sys
 cores = int(sys.argv.pop(1))
