@@ -122,6 +122,11 @@ SPEEDS = "--over=scene.speed_rpm=1000:2000:2"
         (["simulate", CIC, "--set=scene.speed_rpm=fast"], ["scene.speed_rpm", "number", "fast"]),
         (["simulate", CIC, "--set=profile.involute_length_mm=20"], ["involute_length_mm", "20"]),
         (["simulate", CIC, "--set", "scene.speed_rpm"], ["dotted.key=value"]),
+        (
+            ["simulate", CIC, "--set=scene.center_distance_error_mm=-0.1",
+             "--set=pump={viscosity_mPa_s: 50, pressure_difference_Pa: 2.0e5}"],
+            ["must not overlap", "raise `contact.clearance_mm`"],
+        ),
         (["sweep", "cic", "--sobol=4", "--zip"], ["does not go with samples"]),
         (["sweep", "cic", "--over=scene.sped_rpm=1,2"], ["did you mean `scene.speed_rpm`"]),
         (["sweep", "cic", SPEEDS, "--over=scene.speed_rpm=3"], ["given twice"]),
@@ -132,7 +137,7 @@ SPEEDS = "--over=scene.speed_rpm=1000:2000:2"
         (["sweep", "cic", "--tolerances=4"], ["section `tolerances`"]),
         (["sweep", "cic", SPEEDS, "--workers=0"], ["from 1"]),
     ],
-)
+)  # fmt: skip
 def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path, command):
     done = command(*arguments, "-o", tmp_path / "out")
     assert (done.returncode, done.out) == (2, "")
