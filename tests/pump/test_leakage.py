@@ -392,6 +392,19 @@ def test_smaller_rotors_have_the_play_of_their_gap():
     assert expected > C
 
 
+def test_sheet_counts_all_that_parts_the_flanks(monkeypatch):
+    """The play is that with clearance, centre distance error and smaller radius, from the config."""
+    monkeypatch.setattr("rootsopt.pump.sheet._leaking", lambda *_: {})
+    scene = scene_of(
+        "pump={viscosity_mPa_s: 50, pressure_difference_Pa: 2.0e5, radial_allowance_mm: 0.01}",
+        "contact.clearance_mm=0.05",
+        "scene.center_distance_error_mm=0.02",
+    )
+    expected = played(scene.profile(DESIGN), C, 2 * R + 2e-5, radial=1e-5).gear_backlash
+    found = sheet(scene, DESIGN)["gear_backlash_max_mm"]
+    assert found == pytest.approx(1e3 * float(expected), rel=1e-9)
+
+
 def test_play_is_smooth_in_the_design():
     """Over moves as short as the sampled points are apart, slopes are those of differences."""
 
