@@ -7,7 +7,7 @@ bifurcation_scene.png and bifurcation_ranges.png, updated after every parameter.
 from experiments._common.driver import Study
 
 STUDY = Study(
-    quick="one start at one speed of one pair",
+    quick="one start at one speed and one torque of one pair",
     published={
         f"bifurcation_{name}.png": f"bifurcation_{name}.png"
         for name in ("speed", "scene", "ranges")

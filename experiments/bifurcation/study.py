@@ -85,7 +85,8 @@ def plans(quick: bool) -> list[Diagram]:
     """Return all diagrams of a full or reduced run, still empty."""
     if quick:
         config = shipped("cic", *LIVELY)
-        return [Diagram("livelier", config, SPEED, 3500, 4500, 1, STARTS[1:2])]
+        spans = (SPEED, 3500, 4500), (TORQUE, 4.5, 5.0)
+        return [Diagram("livelier", config, *span, 1, STARTS[1:2]) for span in spans]
     cic = shipped("cic")
     return [
         *(
