@@ -57,6 +57,9 @@ _FORK = 30.0
 # to |ε|: on epicycloids, this one lies at most 0.6 |ε| before the cusp, the other one at least
 # 5 |ε| where they are equally deep.
 _NEAR_CUSP = 1.8
+BEYOND = 0.05
+"""Distance (rad) from the range of the search's nodes above which a root outside it is rejected.
+The flanks then count as having no common normal."""
 # Number of extra nodes between the edge of a land, or a joint of a forked flank, and the next node.
 # Their distances from the edge double from one to the next.
 _CROWD = 12
@@ -69,8 +72,9 @@ class FlankPair(eqx.Module):
 
     `profile`: both rotors' profile; `frozen`: the same profile without derivatives, for the search;
     `nodes`: see `FlankNodes`; `center_distance`: E (m); `rolling`: whether the flanks are conjugate
-    and E is the distance of perfect rolling; `together`: whether many poses are searched in groups,
-    which is faster, but takes longer to compile.
+    and E is the distance of perfect rolling. Otherwise, a contact may be handed over: it slides
+    over a lobe's axis, from one flank of the lobe to the other. `together`: whether many poses are
+    searched in groups, which is faster, but takes longer to compile.
     """
 
     profile: Profile
@@ -197,8 +201,9 @@ class FlankPair(eqx.Module):
 
         Derivatives of the gap jump there: second derivatives with respect to the pose, and first
         derivatives of the levers with respect to the design. There is a number for each of `edges`
-        and each rotor. The one for a common normal is 1 or -1, because it changes only where the
-        flanks are apart.
+        and each rotor. The first number belongs to the common normal. If the contact may be handed
+        over, it is the distance (rad) of the contact from the lobe's axis. Otherwise it is 1 or -1,
+        because it changes only where the flanks are apart.
 
         `roll`: x (rad); `closest`: closest approach at this pose; `rival`: gap (m) of the minimum
         to which the contact jumps, if known. The number for the jump then passes smoothly through
@@ -206,7 +211,9 @@ class FlankPair(eqx.Module):
         normals = jnp.stack([closest.normal1, closest.normal2])
         beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch
-        numbers = [jnp.where(closest.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
+        inside = 1.0 if self.rolling else closest.normal2 - self.nodes.normal[0]
+        found = jnp.where(closest.found, inside, -1.0)
+        numbers = [found, trig.sin(jnp.pi / 2 * (roll - half) / half)]
         if self.jumps:
             numbers.append(self._leap(closest) if rival is None else rival - closest.gap)
         if self.frozen.wavy:
@@ -319,14 +326,18 @@ class FlankPair(eqx.Module):
         return self.rolling and not self.frozen.wavy
 
     def _missing(self, roll) -> ClosestApproach:
-        """Return the closest approach of flanks without a common normal, at a `roll` (rad)."""
+        """Return the closest approach of flanks without a common normal, at a `roll` (rad).
+
+        If the contact may be handed over, its normal angle lies beyond the lobe's axis by twice
+        `BEYOND`. Next to the axis, a `NearContact` would find the contact of the other flank."""
         nothing = jnp.zeros_like(roll)
+        normal2 = 0.0 if self.rolling else self.nodes.normal[0] - 2 * BEYOND
         return ClosestApproach(
             gap=jnp.full_like(roll, self.profile.pitch_radius),
             lever1=nothing,
             lever2=nothing,
             normal1=nothing,
-            normal2=nothing,
+            normal2=nothing + normal2,
             found=jnp.zeros(roll.shape, bool),
             rank=nothing,
         )

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from rootsopt.contact.closest import FlankPair, contact_begins
+from rootsopt.contact.closest import BEYOND, FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, ClosestApproach, Contact, ContactPoint
 from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
@@ -92,9 +92,6 @@ _FARTHEST = 0.06
 # Distance (rad) from a given root at which the offset is linearised. An event may lie exactly where
 # a segment ends. Automatic differentiation would give a mixture of both slopes there.
 _ASIDE = 1e-12
-# Distance (rad) from the range of the search's nodes above which a root outside it is rejected. The
-# flanks then count as having no common normal.
-_BEYOND = 0.05
 
 
 class NearContact(_FlankContact):
@@ -155,10 +152,12 @@ class NearContact(_FlankContact):
         offset, gap, normal1, lever1, lever2 = here
         falls = turned[0] < 0
         step = jnp.where(falls, -offset / jnp.where(falls, turned[0], -1.0), 0.0)
-        low, high = pair.nodes.normal[0] - _BEYOND, pair.nodes.normal[-1] + _BEYOND
+        low, high = pair.nodes.normal[0] - BEYOND, pair.nodes.normal[-1] + BEYOND
         present = falls & (jnp.abs(step) < _FARTHEST) & (root > low) & (root < high)
         present &= folded >= contact_begins(relative)
         step = jnp.clip(step, -_FARTHEST, _FARTHEST)
+        if not pair.rolling:  # A contact of the other flank of the lobe stays there.
+            step = jnp.where(root > low, step, 0.0)
         # The gap is stationary at the root: half a step's slope is its mean over the step.
         gap = gap + turned[1] * step / 2
         lever1, lever2 = lever1 + turned[3] * step, lever2 + turned[4] * step

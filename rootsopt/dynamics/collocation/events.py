@@ -106,13 +106,16 @@ class Kinds(NamedTuple):
     `vague` (f,): whether the flag has no margin of its own, so that it does not tell how an event
     moves. `jump` (f,): index of the margin that is zero where the contact jumps, if the flag may
     change there, otherwise -1. `only` (f,): whether the flag's change is an event only if the
-    contact jumps. `flank` (f,): index of the flag's flank.
+    contact jumps. `hand` (f,): index of the margin that is zero where the flank hands its contact
+    over to the other flank of the lobe, if it may do so, otherwise -1. `flank` (f,): index of the
+    flag's flank.
     """
 
     rank: Int[np.ndarray, " f"]
     vague: Bool[np.ndarray, " f"]
     jump: Int[np.ndarray, " f"]
     only: Bool[np.ndarray, " f"]
+    hand: Int[np.ndarray, " f"]
     flank: Int[np.ndarray, " f"]
 
 
@@ -124,18 +127,21 @@ def kinds(pair: RotorPair) -> Kinds:
         for some in (of_flank, others)
     )
     per, law, contact = len(own), of_flank[0][1], innermost(pair.contact)
-    rank, jump, only = 2 + np.arange(per), np.full(per, -1), np.zeros(per, bool)
+    rank, only = 2 + np.arange(per), np.zeros(per, bool)
+    jump, hand = np.full((2, per), -1)
     if type(contact) is SearchContact:
         rank[law] = -1
+        hand[:] = -1 if contact.pair.rolling else law
         if contact.jumps:
             place = law + 2
             rank[place], jump[place : law + of_flank[1][1]] = 1, place
             only[place : place + 1 + RANKS] = contact.pair.profile.wavy
     number = np.repeat(np.arange(pair.flanks), per)
-    rank, own, jump, only = (np.tile(row, pair.flanks) for row in (rank, own, jump, only))
-    jump = np.where(jump < 0, -1, jump + per * number)
-    of_pair = (0, rest, -1, False, 0)
-    rows = zip((rank, own, jump, only, number), of_pair, strict=True)
+    rows = (np.tile(row, pair.flanks) for row in (rank, own, jump, only, hand))
+    rank, own, jump, only, hand = rows
+    jump, hand = (np.where(row < 0, -1, row + per * number) for row in (jump, hand))
+    of_pair = (0, rest, -1, False, -1, 0)
+    rows = zip((rank, own, jump, only, hand, number), of_pair, strict=True)
     return Kinds(*(np.append(row, np.broadcast_to(last, rest.shape)) for row, last in rows))
 
 
@@ -248,10 +254,10 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     """Return `elements` with `roots` from `seen`, the result of `look`.
 
     At the end of an element, the first root belongs to the side on which the flanks push. Where the
-    contact jumps, it belongs to the instant before the end. The second root, that of the minimum to
-    which the contact may jump, belongs to the instant after the end. Both are extrapolated to the
-    end: otherwise derivatives of a peak at a corner of the force would have a relative error of
-    about 5e-6."""
+    contact jumps or is handed over, it belongs to the instant before the end. The second root, that
+    of the minimum to which the contact may jump, belongs to the instant after the end. Both are
+    extrapolated to the end: otherwise derivatives of a peak at a corner of the force would have a
+    relative error of about 5e-6."""
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)
     nodes = seen.roots[:, :POINTS]
@@ -263,8 +269,10 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     aside = seen.tau.reshape(*number.shape, -1)[:, -2:, None] - end
     moved = seen.roots[:, POINTS:] - aside * jnp.stack([before, after], axis=1)
     own = seen.pushes[:, POINTS] | ~seen.pushes[:, POINTS + 1]
-    jumps = np.unique(kinds(pair).jump)
+    kind = kinds(pair)
+    jumps, hands = (np.unique(indices) for indices in (kind.jump, kind.hand))
     which = jnp.where(mesh.last, mesh.which[mesh.interval + 1], FIXED)
+    own |= jnp.isin(which, hands[hands >= 0])[:, None]
     for flank, jump in enumerate(jumps[jumps >= 0]):
         own = own.at[:, flank].set(own[:, flank] | (which == jump))
     ends = jnp.stack([jnp.where(own, moved[:, 0], moved[:, 1]), moved[:, 1]], axis=-1)
@@ -308,8 +316,9 @@ def _compared(
     real = mesh.last[element] & (mesh.times[ends_at] < mesh.times[-1]) & (element < mesh.used)
     declared = (inside == per - 2) & real & (number < seen.total)
     which = mesh.which[ends_at][:, None]
-    # A jump shows in any flag of its flank.
-    tells = (which == np.arange(kind.rank.size)) | (which == kind.jump) & (which >= 0)
+    # A jump and a handover show in any flag of their flank.
+    flank = (which == kind.jump) | (which == kind.hand)
+    tells = (which == np.arange(kind.rank.size)) | flank & (which >= 0)
     tells |= (which == UNSAID) & kind.vague
     kept = declared & ((which[:, 0] == FIXED) | jnp.any(differ & tells, axis=1))
     held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
@@ -364,16 +373,21 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, fresh, later, 
             margins = pair.margins(tau, elements.motion(tau))
             return margins.values[flag[k]], _roots(pair, margins)[flank[k]]
 
-        time, before, after = zero_of(margin, seen.tau[place[k]], later[place[k]], value[k])
-        return events[0].at[k].set(time), events[1].at[k].set(jnp.abs(after - before))
+        results = zero_of(margin, seen.tau[place[k]], later[place[k]], value[k])
+        return jax.tree.map(lambda old, x: old.at[k].set(x), events, results)
 
-    nothing = jnp.full(most, jnp.inf, seen.tau.dtype), jnp.zeros(most, seen.tau.dtype)
-    located, change = lax.fori_loop(0, jnp.minimum(number, most), locate, nothing)
-    jump, leap = kind.jump[flag], change > _LEAP
+    nothing = jnp.zeros(most, seen.tau.dtype)
+    start = jnp.full_like(nothing, jnp.inf), nothing, nothing
+    located, before, after = lax.fori_loop(0, jnp.minimum(number, most), locate, start)
+    jump, leap = kind.jump[flag], jnp.abs(after - before) > _LEAP
     located = jnp.where(kind.only[flag] & ~leap, jnp.inf, located)
     new = jnp.sum(located < jnp.inf)
     times = jnp.concatenate([located, jnp.where(held, mesh.times, jnp.inf)])
     which = jnp.where(leap & (jump >= 0), jump, flag)
+    if isinstance(contact := innermost(pair.contact), SearchContact):
+        # A handover is an event of the flank that the contact leaves at the lobe's axis.
+        leaves = leap & (jnp.abs(before - contact.pair.nodes.normal[0]) < _LEAP)
+        which = jnp.where(leaves & (kind.hand[flag] >= 0), kind.hand[flag], which)
     which = jnp.concatenate([jnp.where(kind.vague[flag], UNSAID, which), mesh.which])
     times, which, count = _merged(times, which, kind.rank)
     fits = (number <= most) & (count <= room - 3)
@@ -385,7 +399,7 @@ def _merged(times, which, rank):
 
     `times`: inf for missing events; `which`: index of each event's margin, `FIXED` or `UNSAID`;
     `rank`: see `Kinds`. Return the merged times and margins, and the number of events."""
-    importance = jnp.where(which == UNSAID, rank.shape[0] + 2, rank[which])
+    importance = jnp.where(which == UNSAID, rank.shape[0] + 2, jnp.maximum(rank[which], 0))
     importance = jnp.where(which == FIXED, -1, importance)
     order = jnp.lexsort((importance, times))
     times, which, importance = times[order], which[order], importance[order]

@@ -177,15 +177,17 @@ def test_peak_is_located(place, corner):
 ARCS = (
     "profile={family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964, "
     "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22}",
+    "scene.center_distance_error_mm=-0.05",
     "optimizer.bounds={}",
 )
 
 
-def test_a_jump_of_the_contact_is_an_event():
-    """At constant ε, the contact of four arcs jumps over their joint twice in a mesh period.
+def test_a_jump_and_a_handover_of_the_contact_are_events():
+    """At constant ε, the contact of four arcs jumps over their joint twice in a mesh period, and
+    twice slides over a lobe's axis to the other flank.
 
-    Other changes of segment are events of their own. The events are those of a search at many
-    instants."""
+    Other changes of segment are events of their own. The jumps are those of a search at many
+    instants. At a handover, the tip arc's centre lies on the axis of the other rotor's root."""
     config = load_config("cic_drawn", ARCS)
     pair, count = Evaluator.of(config).pair(config.design), 240
     edges = jnp.linspace(0.0, 1.0, count + 1)
@@ -200,19 +202,31 @@ def test_a_jump_of_the_contact_is_an_event():
     still = jnp.asarray([-1e-3 / pair.angle_scale, 0.0])
     elements = Elements(
         mesh, jnp.tile(still, (count, 1)), jnp.zeros((count, POINTS, 2)),
-        jnp.zeros((count, POINTS + 1, 1, 2)),
+        jnp.zeros((count, POINTS + 1, 2, 2)),
     )  # fmt: skip
+
+    jumping = kinds(pair).jump
+    _, jump, _ = sorted(set(jumping))
+    _, *hands = sorted(set(kinds(pair).hand))
 
     @eqx.filter_jit
     def searched(pair, instants):
+        def at(tau):
+            margins = pair.margins(tau, still)
+            return margins.places.normal2[0], margins.values[hands[0]]
+
         events = found_events(pair, elements, look(pair, elements))
-        normals = jax.lax.map(lambda tau: pair.margins(tau, still).places.normal2[0], instants)
-        return events.which, events.times, normals
+        return events.which, events.times, *jax.lax.map(at, instants)
 
     instants = np.linspace(0.5, 1.0, 8001)[1:-1]
-    which, found, normals = map(np.asarray, searched(pair, jnp.asarray(instants)))
-    jumping = kinds(pair).jump
-    (jump,) = set(jumping) - {-1}
+    which, found, normals, past = map(np.asarray, searched(pair, jnp.asarray(instants)))
+    # The normal of a lobe's axis has the angle 0.
+    assert past[normals > 0].tolist() == normals[normals > 0].tolist()
+    assert [which[np.isin(which, hands)].tolist(), len(hands)] == [hands, 2]
+    tip, root = 23.964, 65.95 - 23.964
+    turns = np.array([root, tip]) * -1e-3 / (tip - root)
+    at = [0.0, 0.5] + np.array([1, -1]) * turns / (2 * np.pi / 3)
+    np.testing.assert_allclose(found[np.isin(which, hands)], at, rtol=0, atol=1e-8)
     change = np.abs(np.diff(normals))
     jumps = instants[np.flatnonzero(change > 20 * np.median(change))]
     assert len(jumps) == 2
@@ -220,22 +234,25 @@ def test_a_jump_of_the_contact_is_an_event():
     crossings = found[np.isin(which, np.flatnonzero(jumping == jump)) & (which != jump)]
     assert len(crossings) == 2
     assert np.max(np.abs(crossings - 0.75)) < 2e-3
-    # At a jump, the element before it keeps its own minimum, also if only the other side pushes.
-    half = count // 2
-    cut = Mesh(
-        mesh.times.at[1].set(0.5),
-        mesh.which.at[1].set(jump),
-        jnp.repeat(jnp.arange(2), half),
-        jnp.tile(edges[:-1:2], 2),
-        jnp.tile(edges[2::2], 2),
-        mesh.used,
-    )
-    roots = jnp.zeros((count, POINTS + 2, 1)).at[:, -2:, 0].set(jnp.asarray([1.0, 2.0]))
+    # At a jump, the element before it keeps its own minimum, also if only the other side pushes. At
+    # a handover, both flanks keep theirs.
+    half, roots = count // 2, jnp.zeros((count, POINTS + 2, 2)).at[:, -2].set(1.0)
     pushes = jnp.zeros(roots.shape, bool).at[:, -1].set(True)
-    empty = jnp.zeros((2 * count, 1), bool)
-    seen = FlagScan(jnp.repeat(cut.ends[1], 2), empty, empty, roots, pushes, jnp.asarray(2 * count))
-    new = eqx.filter_jit(rooted)(pair, elements._replace(mesh=cut), seen)
-    np.testing.assert_array_equal(np.flatnonzero(new.roots[:, -1, 0, 0] == 1.0), [half - 1])
+    empty, keep = jnp.zeros((2 * count, 1), bool), eqx.filter_jit(rooted)
+    for event, flanks in ((jump, [0]), (hands[0], [0, 1])):
+        cut = Mesh(
+            mesh.times.at[1].set(0.5),
+            mesh.which.at[1].set(event),
+            jnp.repeat(jnp.arange(2), half),
+            jnp.tile(edges[:-1:2], 2),
+            jnp.tile(edges[2::2], 2),
+            mesh.used,
+        )
+        instants = jnp.repeat(cut.ends[1], 2)
+        seen = FlagScan(instants, empty, empty, roots, pushes, jnp.asarray(2 * count))
+        new = keep(pair, elements._replace(mesh=cut), seen)
+        kept = np.argwhere(np.asarray(new.roots[:, -1, :, 0]) == 1.0)
+        assert kept.tolist() == [[half - 1, flank] for flank in flanks]
 
 
 @pytest.mark.parametrize("order", [0.55, 2.0, 8.0])

@@ -38,6 +38,7 @@ ARCS = [
     "scene.load.torque_N_m=20",
     "optimizer.bounds={}",
 ]
+BEARINGS = ["scene.supports={stiffness_N_per_mm: 20000, damping_N_s_per_mm: 2}"]
 
 
 @pytest.mark.long
@@ -54,10 +55,11 @@ ARCS = [
         ("cic_drawn", ["contact.wear.depth_mm=0.02"], 1),
         ("cic_drawn", ARCS, 1),
         ("cic_drawn", ["scene.center_distance_error_mm=0.03"], 1),
+        ("cic_drawn", BEARINGS, 1),
     ],
     ids=[
         *("cic_drawn", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted"),
-        *("worn", "contact jumps over a joint", "centre distance"),
+        *("worn", "contact jumps over a joint", "centre distance", "contact slides over a tip"),
     ],
 )
 def test_orbit_is_that_by_shooting(name, overrides, period):
