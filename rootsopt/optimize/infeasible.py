@@ -109,10 +109,31 @@ class Infeasible(NamedTuple):
             f"{'; '.join(lines)}. {advice}"
         )
 
+    def feasible(self, problem: "Problem") -> NDArray[np.float64] | None:
+        """Return the point (d,) of the design if it satisfies all constraints after all."""
+        if not self.violation <= FEASIBLE:
+            return None
+        return problem.point([*self.design.values()])
+
     def record(self) -> dict[str, Any]:
         """Return the entries `violation`, `conflicts` and `design` of the result file."""
         conflicts = [one._asdict() for one in self.conflicts]
         return {"violation": self.violation, "conflicts": conflicts, "design": self.design}
+
+
+def feasible_points(
+    problem: "Problem", sample: Sequence[NDArray[np.float64]]
+) -> tuple[list[NDArray[np.float64]], Infeasible | None]:
+    """Return the feasible points (d,) of a `sample`; if no design is feasible, the reason.
+
+    The steps onto the feasible set may fail for every point of a small sample. The search for the
+    least violation may then still find a feasible design, which is the only point."""
+    points = [point for point in sample if problem.feasible(point)]
+    if points:
+        return points, None
+    reason = explain(problem, sample)
+    point = reason.feasible(problem)
+    return ([], reason) if point is None else ([point], None)
 
 
 def explain(

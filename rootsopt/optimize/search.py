@@ -24,7 +24,7 @@ from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
 from rootsopt.optimize.bounding import BETTER, FIRST, MOST, PARAMETERS, QUICK, TOGETHER, Bounding
-from rootsopt.optimize.infeasible import Infeasible, beginning, explain
+from rootsopt.optimize.infeasible import Infeasible, beginning, explain, feasible_points
 from rootsopt.optimize.limits import force_limits, limited, needs_maxima
 from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.outcome import (
@@ -170,9 +170,8 @@ class Search:
         self._baseline = baseline
         start = self.problem.point(list(first.design.values()))
         sample = self.stage.sample(self.problem, start, self.settings)
-        points = [point for point in sample if self.problem.feasible(point)]
-        if not points:
-            reason = explain(self.problem, sample)
+        points, reason = feasible_points(self.problem, sample)
+        if reason is not None:
             return Optimization(
                 self.problem, baseline, None, [], {}, self.stop.is_set(), infeasible=reason
             )
@@ -187,13 +186,15 @@ class Search:
             if self.noisy and (outcome := self.so_far()) is not None:
                 return outcome
             trials = self._in_order()
+        if self.problem.limits and not any(trial.candidate for trial in trials):
+            further, reason = self._unmet(points, self.stage.first + len(starts))
+            trials += further
         rows = history_of(trials)
         if self.noisy:
             noise.add_errors(rows, trials, self.problem)
             outcome = noise.verify(self.problem, self.exact, trials)
             return dataclasses.replace(outcome, history=rows, interrupted=self.stop.is_set())
         if self.problem.limits and not any(trial.candidate for trial in trials):
-            reason = None if self.stop.is_set() else self._unmet(points)
             return Optimization(
                 self.problem, baseline, None, rows, {}, self.stop.is_set(), infeasible=reason
             )
@@ -358,17 +359,25 @@ class Search:
             return []
         return [self._evaluate(self.fast.without_gradient(), point, -1, 0, key=(-1, number))]
 
-    def _unmet(self, points: list[NDArray[np.float64]]) -> Infeasible:
-        """Return why no design satisfies the limits of forces.
+    def _unmet(
+        self, points: list[NDArray[np.float64]], number: int
+    ) -> tuple[list[Trial], Infeasible | None]:
+        """Return why no design satisfies the limits of forces; `None` if the search was stopped.
 
-        `points`: feasible points (d,), used if the local searches found none."""
+        If a design satisfies them after all, the trials of a local search from there come first.
+        `points`: feasible points (d,), used if the local searches found none; `number`: index of
+        the local search."""
+        if self.stop.is_set():
+            return [], None
         look = self.problem.looks(self.sharp)
         usable = [outcome for outcome in self._descents.values() if outcome.local is not None]
         usable.sort(key=lambda outcome: outcome.local.violation if outcome.local else np.inf)
         begins = [outcome.point for outcome in usable[: _SIMULATED - 1]] + points[:1]
-        return explain(
+        reason = explain(
             self.problem, begins, lambda point: None if self.stop.is_set() else look(point)
         )
+        point = reason.feasible(self.problem)
+        return ([] if point is None else self._side_by_side(self._solve, [(number, point)])), reason
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Search from `point` (d,) by sequential quadratic programming, and return the trials.

@@ -1,6 +1,8 @@
 """Limits of any quantity: as constraints of the design space, and as caps of the search."""
 
 import dataclasses
+import threading
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from rootsopt.config.units import words
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
-from rootsopt.optimize.infeasible import explain
+from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import TermConstraint, constraint_rows, limited
 from rootsopt.optimize.local import Certificate, Linearization
 from rootsopt.optimize.problem import Problem
@@ -248,6 +250,23 @@ def test_limits_of_forces_in_conflict_are_explained():
         "mean force": [pytest.approx(130 * exceeded, rel=1e-6), pytest.approx(150, rel=1e-5)],
     }
     assert "peak force <= 150 N (possible with the others: 170 N)" in found.message
+
+
+@pytest.mark.parametrize(("violation", "searches"), [(0.0, [7]), (0.1, [])])
+def test_a_design_that_meets_all_limits_after_all_is_searched_from(
+    violation, searches, monkeypatch
+):
+    problem, begins = problem_of(PEAK + "150"), np.array([0.25, 0.5, 0.75])
+    reason = Infeasible(violation, (), problem.named(begins), True)
+    monkeypatch.setattr("rootsopt.optimize.search.explain", lambda *_: reason)
+    asked = []
+    search = SimpleNamespace(
+        stop=threading.Event(), problem=problem, sharp=print, _descents={}, _solve=None,
+        _side_by_side=lambda work, tasks: asked.extend(tasks) or [],
+    )  # fmt: skip
+    assert Search._unmet(search, [], 7) == ([], reason)
+    assert [number for number, _ in asked] == searches
+    assert all(point == pytest.approx(begins, abs=1e-9) for _, point in asked)
 
 
 @pytest.mark.long

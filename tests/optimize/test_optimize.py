@@ -23,7 +23,7 @@ from rootsopt.commands.table import optimize as command
 from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.optimize.infeasible import explain
+from rootsopt.optimize.infeasible import feasible_points
 from rootsopt.optimize.limits import constraint_rows, limited
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import Stage
@@ -147,8 +147,8 @@ def test_contradicting_constraints_are_explained():
         "constraints.outer_radius_max_mm=42.0", area, seal, "optimizer.screening=4"
     )
     sample = Stage().sample(problem, np.full(3, 0.5), problem.config.optimizer)
-    assert not any(map(problem.feasible, sample))
-    found = explain(problem, sample)
+    points, found = feasible_points(problem, sample)
+    assert points == []
     alone = {one.name: one.alone for one in found.conflicts}
     assert {"area efficiency", "outer radius"} <= alone.keys()
     assert found.violation > 0.1
@@ -158,6 +158,12 @@ def test_contradicting_constraints_are_explained():
         radius = alone["outer radius"] + shift
         again = problem_of(area, f"constraints.outer_radius_max_mm={radius}", seal)
         assert any(again.feasible(again.project(p)) for p in sobol(8, 3)) == possible
+        # A search that begins at a design outside finds it, too.
+        begins = np.full(3, 0.5)
+        assert not again.feasible(begins)
+        points, reason = feasible_points(again, [begins])
+        assert [again.feasible(point) for point in points] == [True] * possible
+        assert (reason is None) == possible
 
 
 def test_search_improves_within_the_constraints():

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rootsopt.config.families import families
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
-from rootsopt.optimize.infeasible import explain
+from rootsopt.optimize.infeasible import Infeasible, feasible_points
 from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Linearization, certify
 from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.sqp import Stops, descend
@@ -123,9 +123,8 @@ class Tracer:
         study = self.study
         if not study.problem.baseline.usable or self.stop.is_set():
             return front_of(self, [])
-        points = self._feasible()
-        if not points:
-            reason = explain(study.problem, self._sample)
+        points, reason = self._feasible()
+        if reason is not None:
             return front_of(self, [], infeasible=reason)
         self._screen(points)
         if self._course.seen and self._ends(points[0]):
@@ -141,13 +140,14 @@ class Tracer:
 
     # The ends of the front.
 
-    def _feasible(self) -> list[NDArray[np.float64]]:
-        """Return the baseline's point and a Sobol sample, moved onto the feasible set."""
+    def _feasible(self) -> tuple[list[NDArray[np.float64]], Infeasible | None]:
+        """Return the baseline's point and a Sobol sample, moved onto the feasible set.
+
+        If there is no feasible design, return no point, and the reason."""
         settings, problem = self.config.optimizer, self.study.problem
         start = problem.project(problem.point([*problem.baseline.design.values()]))
         sample = sobol(settings.screening, settings.seed, len(start))
-        self._sample = [start, *(problem.toward(point, start) for point in sample)]
-        return [point for point in self._sample if problem.feasible(point)]
+        return feasible_points(problem, [start, *(problem.toward(x, start) for x in sample)])
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
         evaluations = self._side_by_side(
