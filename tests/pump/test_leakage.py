@@ -393,7 +393,7 @@ def test_smaller_rotors_have_the_play_of_their_gap():
 
 
 def test_sheet_counts_all_that_parts_the_flanks(monkeypatch):
-    """The play is that with clearance, centre distance error and smaller radius, from the config."""
+    """The play is that with the config's clearance, centre distance error and smaller radius."""
     monkeypatch.setattr("rootsopt.pump.sheet._leaking", lambda *_: {})
     scene = scene_of(
         "pump={viscosity_mPa_s: 50, pressure_difference_Pa: 2.0e5, radial_allowance_mm: 0.01}",
