@@ -136,6 +136,8 @@ def kinds(pair: RotorPair) -> Kinds:
             place = law + 2
             rank[place], jump[place : law + of_flank[1][1]] = 1, place
             only[place : place + 1 + RANKS] = contact.pair.profile.wavy
+            # At another centre distance, a contact can also slide past the cusp.
+            only[place] |= not contact.pair.rolling
     number = np.repeat(np.arange(pair.flanks), per)
     rows = (np.tile(row, pair.flanks) for row in (rank, own, jump, only, hand))
     rank, own, jump, only, hand = rows

@@ -39,6 +39,12 @@ ARCS = [
     "optimizer.bounds={}",
 ]
 BEARINGS = ["scene.supports={stiffness_N_per_mm: 20000, damping_N_s_per_mm: 2}"]
+SOFT = [
+    "scene.speed_rpm=779",
+    "contact.clearance_mm=0.021",
+    "scene.supports={stiffness_N_per_mm: 6483, damping_N_s_per_mm: 1.179}",
+    "scene.load.torque_N_m=2.21",
+]
 
 
 @pytest.mark.long
@@ -56,10 +62,12 @@ BEARINGS = ["scene.supports={stiffness_N_per_mm: 20000, damping_N_s_per_mm: 2}"]
         ("cic_drawn", ARCS, 1),
         ("cic_drawn", ["scene.center_distance_error_mm=0.03"], 1),
         ("cic_drawn", BEARINGS, 1),
+        ("ee", SOFT, 1),
     ],
     ids=[
         *("cic_drawn", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted"),
         *("worn", "contact jumps over a joint", "centre distance", "contact slides over a tip"),
+        "contact slides past a cusp",
     ],
 )
 def test_orbit_is_that_by_shooting(name, overrides, period):
