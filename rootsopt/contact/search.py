@@ -156,7 +156,7 @@ class NearContact(_FlankContact):
         present = falls & (jnp.abs(step) < _FARTHEST) & (root > low) & (root < high)
         present &= folded >= contact_begins(relative)
         step = jnp.clip(step, -_FARTHEST, _FARTHEST)
-        if not pair.rolling:  # A contact of the other flank of the lobe stays there.
+        if not pair.rolling:  # Roots beyond the lobe's axis belong to the other flank, and stay.
             step = jnp.where(root > low, step, 0.0)
         # The gap is stationary at the root: half a step's slope is its mean over the step.
         gap = gap + turned[1] * step / 2

@@ -165,7 +165,8 @@ def explain(
     kinds = best.local.groups[0].tags[:, 0].astype(int)
     shares = np.bincount(kinds, best.certificate.shares[0])
     conflicts = []
-    for k in np.flatnonzero(shares > _PART):
+    # A design that satisfies all constraints after all has none in conflict.
+    for k in np.flatnonzero((shares > _PART) & (best.local.objective > FEASIBLE)):
         excess = float(np.max(best.local.groups[0].values[kinds == k]))
         alone = _alone(parts, int(k), [best.point, *starts], stops)
         conflicts.append(_conflict((*problem.space.constraints, *limits)[k], excess, alone))
