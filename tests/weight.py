@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_929,
-    "statements of the tests": 13_322,
+    "statements of the package": 25_935,
+    "statements of the tests": 13_331,
     "statements of the experiments": 4_479,
     "packages": 13,
     "files of the package": 197,

@@ -125,19 +125,19 @@ class FlankPair(eqx.Module):
             pieces.append(after.start + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
         normal = jnp.sort(jnp.concatenate(pieces))
         mate = frozen.mate(normal)
+        rolling = center_distance is None and profile.conjugate
         nodes = FlankNodes(
             normal=normal,
             facing=mate.facing,
             direction=_circle(mate.facing),
             turned=_circle(frozen.turn_ratio * mate.facing),
             lever=mate.lever,
-            support=None if frozen.conjugate else mate.support,
+            support=None if rolling else mate.support,
         )
         distance = 2 * profile.pitch_radius if center_distance is None else center_distance
         dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
         # Otherwise, XLA would compute the sines of the nodes again at every pose.
         dynamic, nodes = compute_once((dynamic, nodes))
-        rolling = center_distance is None and profile.conjugate
         return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 
     def __call__(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> ClosestApproach:
@@ -286,9 +286,10 @@ class FlankPair(eqx.Module):
         `relative`: ε (rad); `attempt`: number of the first attempt. Attempt 0 is Newton's method
         from the point of perfect rolling. If its result is not reliable, attempts 1 and 2 follow.
         They search the last and the first interval of nodes where T falls through zero. These
-        intervals contain the two minima that the gap may have next to a cusp, or if the centre
-        distance is not nominal. The deeper minimum is returned. If the flanks are not conjugate,
-        the gap may have more minima. The attempts then search the two intervals with the least gap.
+        intervals contain the two minima that the gap may have next to a cusp. The deeper minimum is
+        returned. If the flanks are not conjugate, or not at the distance of perfect rolling, the
+        gap may have more minima: on a land, on an involute and beside the pitch crossing, say. The
+        attempts then search the two intervals with the least gap.
         On a wavy flank, Newton's method may find a minimum that is not the deepest. Attempts 1 to
         `_MINIMA` then search all intervals, one each. All attempts share one loop, which is
         compiled once.

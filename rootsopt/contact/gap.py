@@ -277,8 +277,8 @@ class FlankNodes(NamedTuple):
     `direction` (2, n): cosine and sine of `facing`.
     `turned` (2, n): cosine and sine of `Profile.turn_ratio` times `facing`.
     `lever` (n,): lever (m) of rotor 2's point.
-    `support` (n,): support function (m) of rotor 2's point; `None` for conjugate flanks, whose gap
-    has at most two minima.
+    `support` (n,): support function (m) of rotor 2's point; `None` for conjugate flanks at the
+    distance of perfect rolling, whose gap has at most two minima.
     """
 
     normal: Float[Array, " n"]
@@ -308,11 +308,11 @@ def _rotate(directions, angle):
 def bracket_of(pair: "FlankPair", attempt, roll, relative):
     """Return an interval between two nodes where T falls through zero.
 
-    `roll`, `relative`: as in `FlankPair._mesh`. For conjugate flanks, attempt 1 takes the last such
-    interval and attempt 2 the first; on a wavy flank, attempt k takes the k-th. For other
-    flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the second
-    least gap. The result is ((low, high), first guess, whether such an interval exists, whether
-    there is at most one)."""
+    `roll`, `relative`: as in `FlankPair._mesh`. On a wavy flank, attempt k takes the k-th such
+    interval. For conjugate flanks, attempt 1 takes the last one and attempt 2 the first. Where
+    these have more than two, and for other flanks, attempt 1 takes the interval with the least gap
+    and attempt 2 that with the second least gap. The result is ((low, high), first guess, whether
+    such an interval exists, whether there is at most one)."""
     profile, nodes = pair.profile, pair.nodes
     turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
     normal1 = nodes.facing + 2 * roll
@@ -323,28 +323,37 @@ def bracket_of(pair: "FlankPair", attempt, roll, relative):
     # end of one interval and as the start of the next.
     slack = _SLACK * profile.pitch_radius
     falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
-    if profile.wavy:
-        number = jnp.cumsum(falling)
-        index = jnp.argmax(falling & (number == attempt))
-        present, single = number[-1] >= attempt, number[-1] <= attempt
-    elif nodes.support is None:
+
+    def outermost():
         # The maximum of integers is vectorised, an arg-minimum is not.
         place = jnp.arange(falling.shape[0])
         last = jnp.max(jnp.where(falling, place, -1))
         first = jnp.min(jnp.where(falling, place, place.shape[0]))
-        present, single = last >= 0, first >= last
-        index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
-    else:
+        index = jnp.where(last >= 0, jnp.where(attempt == 1, last, first), 0)
+        return index, last >= 0, first >= last
+
+    def deepest():
         # The derivative of the gap between parallel tangents with respect to their angle is -T.
         gap = pair.center_distance * cos - profile.support(normal1) - nodes.support
         share = _share(offset[:-1], offset[1:])
         least = gap[:-1] - jnp.diff(nodes.facing) * share * offset[:-1] / 2
         # A pair this deep belongs to the other flank of the lobe.
-        falling &= least > -DEEPEST * profile.pitch_radius
-        least = jnp.where(falling, least, jnp.inf)
-        present, single = jnp.any(falling), jnp.sum(falling) < 2
+        near = falling & (least > -DEEPEST * profile.pitch_radius)
+        least = jnp.where(near, least, jnp.inf)
         first = jnp.argmin(least)
         index = jnp.where(attempt == 1, first, jnp.argmin(least.at[first].set(jnp.inf)))
+        return index, jnp.any(near), jnp.sum(near) < 2
+
+    if profile.wavy:
+        number = jnp.cumsum(falling)
+        index = jnp.argmax(falling & (number == attempt))
+        present, single = number[-1] >= attempt, number[-1] <= attempt
+    elif nodes.support is None:
+        index, present, single = outermost()
+    elif profile.conjugate:  # Gaps at all nodes take as long as all else.
+        index, present, single = lax.cond(jnp.sum(falling) > 2, deepest, outermost)
+    else:
+        index, present, single = deepest()
     low, high = nodes.normal[index], nodes.normal[index + 1]
     share = _share(offset[index], offset[index + 1])
     return (low, high), low + (high - low) * share, present, single

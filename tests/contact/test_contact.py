@@ -176,9 +176,8 @@ def _sampled(pair, normals, roll, relative):
     return jax.lax.map(one, (roll, relative))
 
 
-def on_nodes(profile, roll, relative):
-    """Return this for 4001 even nodes on a profile's flank."""
-    pair = paired(profile)
+def on_nodes(pair, roll, relative):
+    """Return this for 4001 even nodes on a pair's flank."""
     normals = jnp.linspace(pair.nodes.normal[0], pair.nodes.normal[-1], 4001)
     found = _sampled(pair, normals, jnp.asarray(roll), jnp.asarray(relative))
     return jax.tree.map(np.asarray, found)
@@ -259,7 +258,8 @@ def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
     moved = np.clip(np.array(WAVY) + rng.uniform(-0.2, 0.2, len(WAVY)) * (seed > 0), -1, 1)
     roll = np.append(rng.uniform(-0.1, 0.4, 200), np.linspace(0.1, 0.11, 100))
     relative = -np.append(10 ** rng.uniform(-4, -2.4, 200), np.full(100, 1.7437e-3))
-    deepest, count, found = on_nodes(FreeForm(3, R, 1.2658 * DEG, moved), roll, relative)
+    pair = paired(FreeForm(3, R, 1.2658 * DEG, moved))
+    deepest, count, found = on_nodes(pair, roll, relative)
     touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
     assert touching.sum() > 100
     np.testing.assert_allclose(found.gap[touching], deepest[touching], rtol=0, atol=5e-8)
@@ -296,10 +296,22 @@ def test_deeper_minimum_away_from_rolling_is_found(family, design):
     turn = np.append(rng.uniform(2e-3, 5e-3, 100), 10 ** rng.uniform(-5, -2.4, 200))
     beside = float(joint) + rng.uniform(-8, 8, 100) * turn[-100:]
     roll = np.concatenate([rng.uniform(0.1, 0.3, 100), rng.uniform(-0.05, 0.5, 100), beside])
-    deepest, count, found = on_nodes(profile, roll, -turn)
+    deepest, count, found = on_nodes(paired(profile), roll, -turn)
     touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
     assert np.sum(touching & (count > 1)) > 5
     np.testing.assert_allclose(found.gap[touching], deepest[touching], rtol=0, atol=5e-8)
+
+
+def test_deepest_of_three_minima_is_found_at_a_small_centre_distance():
+    """The gap has a minimum on the land, on the involute and beside the pitch crossing. Intervals
+    of nodes lead to the first or the last one, and the involute's may be the deepest."""
+    two_sided = jax.jit(functools.partial(FlankPair.of, two_sided=True))
+    pair = two_sided(PROFILES["paper"], 2 * R - 5e-5)
+    rng = np.random.default_rng(0)
+    roll, turn = rng.uniform(0.06, 0.07, 300), rng.uniform(1.4e-3, 1.7e-3, 300)
+    deepest, count, found = on_nodes(pair, roll, -turn)
+    assert np.sum(count > 2) > 20
+    np.testing.assert_allclose(found.gap, deepest, rtol=0, atol=5e-8)
 
 
 @jax.grad

@@ -169,7 +169,7 @@ _EVERY = [
     *(Case(f"bare, {name}", "cic_drawn", [*_BARE, *more]) for name, more in _PARTS.items()),
     Case("stalled", "cic_drawn", ["scene.drive=torque",
                             "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"]),
-    Case("no room for a check", "cic_drawn",
+    Case("inaccurate, no room for a check", "cic_drawn",
          [*_sections(damping="0.05", load="2", speed="6000"), "solver.max_steps_per_period=320"]),
     *(Case(name, "cic_drawn", [_profile(*rest)]) for name, rest in _FAMILIES.items()),
     Case("worst motion", "cic_drawn", [*_TWO, *_GRID, *_sections(speed="6000"),
