@@ -13,7 +13,7 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_935,
+    "statements of the package": 25_936,
     "statements of the tests": 13_331,
     "statements of the experiments": 4_479,
     "packages": 13,

@@ -333,6 +333,7 @@ def bracket_of(pair: "FlankPair", attempt, roll, relative):
         return index, last >= 0, first >= last
 
     def deepest():
+        assert nodes.support is not None
         # The derivative of the gap between parallel tangents with respect to their angle is -T.
         gap = pair.center_distance * cos - profile.support(normal1) - nodes.support
         share = _share(offset[:-1], offset[1:])
