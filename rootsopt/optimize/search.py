@@ -362,9 +362,10 @@ class Search:
     def _unmet(
         self, points: list[NDArray[np.float64]], number: int
     ) -> tuple[list[Trial], Infeasible | None]:
-        """Return why no design satisfies the limits of forces; `None` if the search was stopped.
+        """Return the trials of a further local search, and why no design satisfies the limits of
+        forces (`None` if the search was stopped).
 
-        If a design satisfies them after all, the trials of a local search from there come first.
+        There are trials only if a design satisfies the limits after all; the search begins there.
         `points`: feasible points (d,), used if the local searches found none; `number`: index of
         the local search."""
         if self.stop.is_set():

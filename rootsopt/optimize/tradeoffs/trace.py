@@ -143,7 +143,7 @@ class Tracer:
     def _feasible(self) -> tuple[list[NDArray[np.float64]], Infeasible | None]:
         """Return the baseline's point and a Sobol sample, moved onto the feasible set.
 
-        If there is no feasible design, return no point, and the reason."""
+        The second result says why no design is feasible; it is `None` if one is."""
         settings, problem = self.config.optimizer, self.study.problem
         start = problem.project(problem.point([*problem.baseline.design.values()]))
         sample = sobol(settings.screening, settings.seed, len(start))
